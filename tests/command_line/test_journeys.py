@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers.line import line_text
@@ -78,11 +79,37 @@ OF_AN_END = edited(
 BENDS = edited(f"{PLAN},", f"{PLAN[:-1]}, hessian=fp.ExactHessian()),")
 TOO = '"Too": fp.ComputedTorque(tracking, fp.Sigmoid(gain=0.5, scale=1.0)'
 WRONG_SIGN = edited("gain=-0.5)", f"gain=0.5, scale=1.0)), {TOO}")
+INTERRUPTED = edited(
+    "controllers = {",
+    """metrics = [fp.Metric("last", lambda problem, run: stop(run))]
+def stop(run):
+    if run.controller == "CTC+FPI":
+        raise KeyboardInterrupt
+    return 1.0
+controllers = {""",
+)
+FAST = edited("measure_from", 'limits=fp.Limits(states={"y\'": (-0.5, 0.5)}), measure_from')
 WITH_CASES = edited("controllers = {", 'cases = fp.Cases({"soft": {"exact.k": 1.0}})\ncontrollers = {')
 MASS = "A mass on a line with a wrong gain. Errors from t = 0.5 s on, seed 0."
 RUN = "A mass on a line with a wrong gain."
-# What is done before, the words, the exit code, and what the first line says. Those of a row follow one another.
-JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
+
+
+def of_whole_run() -> None:
+    """Every signal of a run is kept."""
+    kept = fp.load_run("kept/CTC_FPI.npz")
+    assert {name: len(kept[name]) for name in kept.layout}["deformed"] == len(kept["deformed.y"]) == 500
+
+
+def of_whole_file() -> None:
+    """The results are those of the whole file, also after a part of it has run."""
+    facts = json.loads(Path("results/line/results.json").read_text())
+    errors = {name: one["metrics"]["rms_error"]["y"] for name, one in facts["controllers"].items()}
+    assert (errors["CTC+FPI"] < 0.9 * errors["CTC"], facts["seed"]) == (True, 3)
+
+
+SLOWLY = "virtual machine, more slowly, because --no-compile was given"
+# What is done before, the words, the exit code, what the first lines say, and what else is said. Those of a row follow one another.
+JOURNEYS: dict[str, list[tuple[Any, ...]]] = {
     "help": [(None, "", 0, "Usage: fpirhc"), (None, "help run", 0, "Usage: fpirhc run"), (None, "--version", 0, "fpirhc 0.")],
     "list": [(None, "list", 0, "first examples")],
     "review": [
@@ -102,6 +129,15 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "compare --controllers CTC --json line.py --no-compile", 0, "{"),
         (WRONG_SIGN, "compare line.py --no-compile", 2, "fpirhc: problem 'line': controllers 'CTC+FPI', 'Too'"),
     ],
+    "kept": [
+        (None, "run line.py CTC+FPI --no-compile --out kept", 0, RUN, SLOWLY),
+        (of_whole_run, "study line.py --draws 1 --no-compile -c CTC", 0, "A mass on a line", SLOWLY),
+        (None, "compare line.py --json --seed 3 --no-compile", 0, "{"),
+        (of_whole_file, "compare line.py --no-compile -c CTC", 0, MASS, "results/line/part/report.html"),
+        (of_whole_file, "compare line.py --no-compile", 0, f"{MASS}\n- CTC+FPI against CTC: better"),
+    ],
+    "left": [(FAST, "compare line.py --no-compile -c CTC", 0, f"{MASS}\n- The reference of", "- CTC leaves a limit: y'")],
+    "interrupted": [(INTERRUPTED, "compare line.py --no-compile", 130, MASS, "CTC+FPI (interrupted before it finished)")],
     "plans": [
         (None, "compare line.py --no-compile -c CTC --set exact.b=1e-3", 1, MASS),  # it does not follow
         (None, "compare line.py --plans", 2, "fpirhc: problem 'line' has no horizon, or none of CTC, CTC+FPI plans"),
@@ -153,9 +189,9 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
 
 @pytest.mark.parametrize("name", JOURNEYS)
 def test_journey(name, folder, monkeypatch, capsys):
-    """Exit code, first line, no traceback, and no file that was not to be written."""
-    monkeypatch.setenv("COLUMNS", "100")
-    for before, words, code, first in JOURNEYS[name]:
+    """Exit code, words, no traceback; a comparison fits on a screen, its verdict comes first, and what it prints is written."""
+    monkeypatch.setenv("COLUMNS", "80" if name == "kept" else "100")
+    for before, words, code, first, *more in JOURNEYS[name]:
         if before:
             before()
         found = main(shlex.split(words))
@@ -163,14 +199,24 @@ def test_journey(name, folder, monkeypatch, capsys):
         said = printed.out if code not in (2, 3) else printed.err
         assert found == code, (words, printed)
         assert said.lstrip().startswith(first), (words, said)
+        assert [one for one in more if one not in printed.out + printed.err] == []
         assert "Traceback" not in printed.err
-    assert folder.exists()
+        if first == "{" and words.startswith("compare"):
+            assert json.loads(said) in [json.loads(file.read_text()) for file in folder.rglob("results.json")]
+        if first.startswith(MASS):
+            verdict, *_ = lines = said.splitlines()[1:]
+            assert (verdict[:2], len(lines) < 20, Path(re.findall(r"report: (\S+)", said)[0]).exists()) == (
+                "- ",
+                True,
+                True,
+            )
+            assert max(map(len, lines[:-1])) <= (80 if name == "kept" else 100)
 
 
 def test_journeys_have_every_command_and_exit_code():
     used = {shlex.split(words)[0] for rows in JOURNEYS.values() for _, words, *_ in rows if words}
     assert {*COMMANDS} - used == {"doctor", "new"}  # below
-    assert {code for rows in JOURNEYS.values() for _, _, code, _ in rows} == {0, 1, 2, 3, 4, 5, 6}
+    assert {code for rows in JOURNEYS.values() for _, _, code, *_ in rows} == {0, 1, 2, 3, 4, 5, 6, 130}
 
 
 def test_options_are_few_and_explained(capsys):
@@ -189,28 +235,12 @@ def test_options_are_few_and_explained(capsys):
     assert options <= 75
 
 
-def test_run_saves_every_signal_and_compare_writes_what_it_prints(folder, capsys):
-    assert main(["run", "line.py", "CTC+FPI", "--no-compile", "--out", "kept"]) == 0
-    kept = fp.load_run(folder / "kept" / "CTC_FPI.npz")
-    assert {name: len(kept[name]) for name in kept.layout}["deformed"] == len(kept["deformed.y"]) == 500
-    assert main(["study", "line.py", "--draws", "1", "--no-compile", "-c", "CTC"]) == 0
-    assert capsys.readouterr().err.count("virtual machine, more slowly, because --no-compile was given") == 2
-    assert main(["compare", "line.py", "--json", "--seed", "3", "--no-compile"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert json.loads((folder / "results/line/results.json").read_text()) == facts
-    errors = {name: one["metrics"]["rms_error"]["y"] for name, one in facts["controllers"].items()}
-    assert (errors["CTC+FPI"] < 0.9 * errors["CTC"], facts["seed"]) == (True, 3)
-    assert main(["compare", "line.py", "--no-compile", "-c", "CTC"]) == 0  # a part, which leaves the whole as it was
-    assert "results/line/part/report.html" in capsys.readouterr().out
-    assert json.loads((folder / "results/line/results.json").read_text()) == facts
-
-
 @pytest.mark.parametrize("step", [0, 3])
 def test_progress_without_a_terminal_is_a_line_at_most_every_two_seconds(step, folder, capsys, monkeypatch):
     monkeypatch.setattr("time.monotonic", count(0, step).__next__)  # a command that takes no time says nothing
-    assert main(["compare", "line.py", "--no-compile"]) == 0
+    assert main(["run", "line.py", "CTC", "--no-compile"]) == 0
     told = re.findall(r"fpirhc: (\S+): 500 of 500 after \d+ s", capsys.readouterr().err)
-    assert told == ["CTC", "CTC+FPI"] * (step > 0)
+    assert told == ["CTC"] * (step > 0)
 
 
 def test_plans_are_certified_side_by_side(folder, capsys, monkeypatch):
@@ -227,15 +257,6 @@ def test_plans_are_certified_side_by_side(folder, capsys, monkeypatch):
     assert "'y' is 0.5 m, below 0.8, at stage 0" in capsys.readouterr().out
 
 
-def test_short_output_has_the_verdict_first_and_fits(folder, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["compare", "line.py", "--no-compile"]) == 0
-    short = capsys.readouterr().out.splitlines()
-    assert short[1].startswith("- CTC+FPI against CTC: ")
-    assert len(short) <= 20
-    assert max(map(len, short[:-1])) <= 80
-
-
 @pytest.mark.parametrize(
     ("error", "code"), [(KeyboardInterrupt(), 130), (ZeroDivisionError("in a model"), 70), (OSError(28, "full"), 3)]
 )
@@ -250,23 +271,6 @@ def test_interrupts_and_crashes_have_codes_of_their_own(error, code, monkeypatch
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert main(["list", "--debug"]) == code
     assert ("Traceback" in capsys.readouterr().err) == (code != 130)
-
-
-INTERRUPTED = """
-metrics = [fp.Metric("last", lambda problem, run: stop(run))]
-def stop(run):
-    if run.controller == "CTC+FPI":
-        raise KeyboardInterrupt
-    return 1.0
-"""
-
-
-def test_ctrl_c_keeps_what_is_finished(folder, capsys):
-    """The finished controller is reported, the other is named as interrupted."""
-    Path("line.py").write_text(Path("line.py").read_text() + INTERRUPTED)
-    assert main(["compare", "line.py", "--no-compile"]) == 130
-    assert (folder / "results/line/report.html").exists()
-    assert "CTC+FPI (interrupted before it finished)" in capsys.readouterr().out
 
 
 def test_a_reader_that_closes_the_output_ends_it_in_silence():

@@ -3,52 +3,37 @@
 import os
 import stat
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import tasks
 
 import fpirhc as fp
 
 posix = pytest.mark.skipif(os.name != "posix", reason="links and modes of POSIX")
 
 
-def page(path: Path) -> None:
-    """Write the page of a comparison without a row."""
-    fp.write_report(empty(), path)
-
-
-@cache
-def empty() -> Any:
-    controllers = {"it": fp.ComputedTorque(fp.Exponential(rate=6.0))}
-    short = replace(driven("mu"), duration=0.05, measure_from=0.0)
-    return replace(fp.compare(tasks.made(short, controllers), seed=0, compiled=False), entries=())
-
-
 def test_what_a_killed_process_left_blocks_no_write(tmp_path):
     """Numbers of processes come again in containers; the longest name of a file system is written."""
-    torn = tmp_path / f".report.html.{os.getpid()}"
+    torn, one = tmp_path / f".run.npz.{os.getpid()}", run(driven("mu"))
     torn.write_text("torn")
-    for name in ("report.html", "n" * 251):
-        page(tmp_path / name)
-        assert "<html" in (tmp_path / name).read_text(encoding="utf-8")
-    assert sorted(one.name for one in tmp_path.iterdir()) == sorted([torn.name, "report.html", "n" * 251])
+    for name in ("run.npz", "n" * 251):
+        one.save(tmp_path / name)
+        assert np.array_equal(fp.load_run(tmp_path / name).log, one.log)
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted([torn.name, "run.npz", "n" * 251])
 
 
 @posix
 def test_links_and_modes_stay(tmp_path):
-    target, link, new = tmp_path / "target.html", tmp_path / "link.html", tmp_path / "new.html"
+    target, link, new = (tmp_path / f"{name}.npz" for name in ("target", "link", "new"))
+    one = run(driven("mu"))
     target.write_text("old")
     target.chmod(0o600)
     link.symlink_to(target)
     for path in (link, new):
-        page(path)
+        one.save(path)
     assert link.is_symlink()
-    assert "<html" in target.read_text(encoding="utf-8")
+    assert np.array_equal(fp.load_run(target).log, one.log)
     assert stat.S_IMODE(target.stat().st_mode) == 0o600
     mask = os.umask(0)
     os.umask(mask)

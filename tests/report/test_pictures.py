@@ -1,18 +1,11 @@
-"""Pictures that a problem wants: what they draw is what the runs hold, and a mistake in one spoils neither file nor report."""
+"""Pictures that a problem wants: what they draw is what the runs hold, and a mistake in one is named."""
 
-import base64
-import io
-import re
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.line import line_text
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 
 import fpirhc as fp
 from fpirhc.contracts import Layout, Signal, scalar
@@ -89,33 +82,6 @@ def test_a_portrait_has_a_panel_for_each_run(runs):
     assert [a.get_title() for a in figure.axes] == ["slow", "quick"]
     np.testing.assert_array_equal(figure.axes[0].lines[0].get_xdata(), runs["slow"]["state.q"])
     assert figure.axes[0].get_ylabel() == "q' [m/s]"
-
-
-FILE = line_text("period=5e-3, duration=0.1", more="pictures = (%s,)\n")
-
-
-def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path):
-    """Its place says why; without pictures there is no section."""
-    path, page = tmp_path / "line.py", tmp_path / "report.html"
-    good, bad = (f"fp.Portrait('{n}', x='state.{x}', y='error.y')" for n, x in (("good", "y"), ("bad", "p")))
-    path.write_text(FILE % f"{good}, {bad}")
-    comparison = fp.compare(fp.load_problem(str(path)), seed=0, compiled=False)
-    fp.write_report(comparison, page)
-    own = page.read_text(encoding="utf-8").partition("Pictures of this problem")[2].partition("</section>")[0]
-    assert own.count("<img") == 1
-    assert "bad is not drawn" in own
-    fp.write_report(replace(comparison, task=replace(comparison.task, pictures=())), page)
-    assert "Pictures of this problem" not in page.read_text(encoding="utf-8")
-
-
-def test_a_picture_of_a_report_has_the_colours_of_its_charts(tmp_path):
-    """The second controller of the file is orange, also alone, and nothing is the blue of the first one."""
-    (tmp_path / "line.py").write_text(FILE % "fp.Portrait('t', x='state.y', y='error.y', controllers=('CTC+FPI',))")
-    fp.write_report(fp.compare(fp.load_problem(tmp_path / "line.py"), seed=0, compiled=False), tmp_path / "report.html")
-    [png] = re.findall(r"data:image/png;base64,([^']*)'", (tmp_path / "report.html").read_text(encoding="utf-8"))
-    pixels = imread(io.BytesIO(base64.b64decode(png)))[..., :3]
-    near = [np.abs(pixels - np.array(to_rgb(colour))).max(axis=-1).min() for colour in ("#d55e00", "#0072b2")]
-    assert (near[0] < 0.15, near[1] > 0.3) == (True, True)
 
 
 def cart(q, p):

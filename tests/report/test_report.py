@@ -2,140 +2,169 @@
 
 import base64
 import hashlib
+import html
+import io
 import json
 import math
 import re
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import casadi as ca
+import numpy as np
 import pytest
 from helpers import tasks
 from helpers.plants import sine_of_three
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
 
 import fpirhc as fp
 from fpirhc.errors import OutputError
 
-
-def problem() -> fp.Problem:
-    """A linear plant with a wrong model that follows a sine."""
-    noise = {"u": fp.Noise(0.01)}
-    return replace(sine_of_three(), start={"y": 0.3}, duration=1.0, measure_from=0.0, disturbances=noise)
+COLOURS = {"plain": "#0072b2", "adaptive": "#d55e00", "exact": "#009e73"}  # by the place in the file
 
 
-def compared(*controllers: str, **changes: Any) -> Any:
-    """A pair of controllers with and without adaptation, and one with the exact model."""
-    track, form = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=5.0)
+def compared(*controllers: str, pictures: Sequence[Any] = (), **changes: Any) -> Any:
+    """A linear plant with a wrong model along a sine: a pair with and without adaptation, and one with the exact model."""
+    track, form, noise = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=5.0), {"u": fp.Noise(0.01)}
     every = {"plain": fp.ComputedTorque(track), "adaptive": fp.ComputedTorque(track, form)}
     every["exact"] = fp.ExactModel(every["plain"])
-    task = tasks.made(replace(problem(), **changes), every, description="    y = 2 x\n\nIts task.")
+    usual = {"start": {"y": 0.3}, "duration": 1.0, "measure_from": 0.0, "disturbances": noise}
+    about = {"description": "    y = 2 x\n\nIts task.", "pictures": tuple(pictures)}
+    task = tasks.made(replace(sine_of_three(), **usual | changes), every, **about)
     return fp.compare(task, controllers=controllers or None, seed=0, compiled=False)
 
 
-@pytest.fixture(scope="module")
-def comparison() -> Any:
-    return compared()
+def ended() -> Any:
+    """The first controller has a run of 300 cycles."""
+    found = compared()
+    entry = found["plain"]
+    short = replace(entry.run, log=entry.run.log[:300], stop="signal 'x' is not finite at t = 0.3 s")
+    own = replace(entry, run=short, metrics=fp.measure(found.task.problem, short))
+    return replace(found, entries=(own, *found.entries[1:]))
 
 
-def data_of(page: str) -> Any:
-    """What the charts of a page show."""
-    begin = page.index("DATA", page.index('{"controllers"') - 20)
-    return json.JSONDecoder().raw_decode(page[page.index("{", begin) :])[0]
+def daily() -> Any:
+    """A tumour with a dose a day, for thirty days."""
+    task = tasks.tumour_daily
+    short = replace(task.problem, duration=30.0, measure_from=10.0)
+    return fp.compare(replace(task, problem=short), seed=0, controllers=["RHC", "RHC+FPI"], compiled=False)
 
 
-@pytest.fixture(scope="module")
-def written(comparison, tmp_path_factory) -> Path:
-    path: Path = tmp_path_factory.mktemp("report") / "report.html"
-    fp.write_report(comparison, path)
-    return path
+HOSTILE = "<script>alert('x')</script> \"& [bold]\x1b[31m</b>"
 
 
-def test_report_is_self_contained_and_small(written):
-    """It opens offline: nothing is fetched, everything is inside; the verdict comes first, then what a reader asks next."""
-    whole = written.read_text(encoding="utf-8")
-    assert len(whole) < 3_000_000
-    assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", whole)
-    assert "@import" not in whole
-    assert [p.name for p in written.parent.iterdir()] == ["report.html"]
-    marks = ("id='verdict'", "<table>", "<h2>Signals over time", "<h3>Contraction", "<h2>The problem", "<h2>Settings")
-    places = [whole.index(mark) for mark in marks]
-    assert places == sorted(places)
-    settings = whole[whole.index("<h2>Settings") :]  # as Python, and only what is no default
-    assert "<pre>fp.ExactModel(controller=fp.ComputedTorque(tracking=fp.Exponential(rate=6.0)))</pre>" in settings
-    assert "deformation=fp.Sigmoid(gain=-0.5, scale=5.0)" in settings
-    assert "<pre class='about'>y = 2 x</pre><p class='about'>Its task.</p>" in whole
+def hostile() -> Any:
+    """Names with tags, markup and control characters."""
+    track, line = fp.Exponential(rate=6.0), tasks.two_mass.problem
+    controllers = {"CTC": fp.ComputedTorque(track), HOSTILE: fp.ComputedTorque(track, fp.Sigmoid(gain=-0.5))}
+    short = replace(line, duration=0.05, measure_from=0.0, horizon=None, cost=None)
+    return fp.compare(tasks.made(short, controllers, title=HOSTILE, description=HOSTILE), seed=0, compiled=False)
 
 
-def test_no_factor_is_the_best_and_no_number_of_those_that_do_not_follow(comparison):
-    [shown] = comparison.view.tables
-    marked = {shown.columns[k].head for row in shown.rows for k in row.best}
-    assert "rms error y [m]" in marked
-    assert not any("contraction" in head for head in marked)
-    lost = compared(limits=fp.Limits(inputs={"u": (-0.01, 0.01)}), duration=3.0)  # the mass goes on
-    assert "No controller follows" in " ".join(lost.verdict)
-    assert not any(row.best for row in lost.view.tables[0].rows)
-    assert {row.cells[1].partition(",")[0] for row in lost.view.tables[0].rows} == {"does not follow"}
-    [quick] = compared("plain", period=1e-9, duration=1e-8).view.tables[0].rows  # no call is done in a nanosecond
-    assert "late 100 %" in quick.cells[1]
+@dataclass(frozen=True)
+class Page:
+    """A comparison, what its page has and what it has not (both as patterns), what it shows as text, and ends of its charts."""
+
+    found: Callable[[], Any]
+    has: Sequence[str] = ()
+    lacks: Sequence[str] = ()
+    shows: Sequence[str] = ()
+    ends: dict[str, Any] = field(default_factory=dict)
 
 
-def test_data_of_the_charts_is_complete(comparison, written):
-    """Every controller and no peak lost."""
-    data = data_of(written.read_text(encoding="utf-8"))
-    assert [c["name"] for c in data["controllers"]] == ["plain", "adaptive", "exact"]
-    error, run = next(c for c in data["charts"] if c["title"] == "error of y"), comparison["plain"].run
-    drawn = error["series"][0]["values"]
-    assert len(drawn) == len(data["time"])
-    assert (max(drawn), min(drawn)) == pytest.approx((run["error.y"].max(), run["error.y"].min()), rel=1e-4)
+GOOD, BAD = (
+    fp.Portrait(n, x=f"state.{x}", y="error.y", controllers=("adaptive",)) for n, x in (("good", "y"), ("bad", "p"))
+)
+ENDS = fp.Limits(inputs={"u": (-20.0, math.inf)}, states={"y": (-9.0, 9.0), "y'": (-4.0, 5.0)}, prices={"y": 1.0})
+SECONDS = r"\d s\b|\[s\]|\b1/s\b|/s\^|[A-Za-z\)]/s\b| s\]"  # a number in seconds, or a unit that has them
+PAGES = {
+    "whole": Page(
+        partial(compared, pictures=(GOOD, BAD)),
+        [
+            r"(?s)id='verdict'.*<table>.*<h2>Signals over time.*<h2>Pictures.*<h3>Contraction.*<h2>The problem.*<h2>Settings",
+            # settings as Python, and only what is no default
+            r"<pre>fp.ExactModel\(controller=fp.ComputedTorque\(tracking=fp.Exponential\(rate=6.0\)\)\)</pre>",
+            r"deformation=fp.Sigmoid\(gain=-0.5, scale=5.0\)",
+            "<pre class='about'>y = 2 x</pre><p class='about'>Its task.</p>",
+            "<img[^>]*good: adaptive", "bad is not drawn",
+        ],
+    ),
+    "part": Page(partial(compared, "exact", "adaptive"), lacks=["Pictures of this problem"]),
+    # A limited state that nobody judges has a chart; a price is no limit, and an error and a free input have none.
+    "limited": Page(
+        partial(compared, "plain", limits=ENDS),
+        ends={"y": ("m", []), "command u": ("N", [-20.0, None]), "y'": ("m/s", [-4.0, 5.0])},
+    ),
+    "left": Page(
+        partial(compared, "plain", limits=fp.Limits(states={"y'": (-1.0, 1.0)})),
+        ["<tr class='red'><th scope='row'>plain</th>", "class='outcome-leaves-a-limit'>plain leaves a limit: y&#39; reach"],
+    ),
+    "ended": Page(ended, ["does not finish: signal &#39;x&#39; is not finite", "<td class='none'>none</td>"]),
+    "empty": Page(lambda: replace(compared("plain"), entries=(), skipped={"x": "because"}), ["No controller finished"]),
+    "days": Page(daily, [r"\[day\]"], [SECONDS]),
+    "hostile": Page(hostile, shows=["<script>alert('x')</script>"]),
+}  # fmt: skip
 
 
-def test_hard_limits_are_in_the_charts_of_what_they_limit(tmp_path):
-    """A limited state that nobody judges has a chart of its own; a price is no limit, and an error and a free input have none."""
-    limits = fp.Limits(inputs={"u": (-20.0, math.inf)}, states={"y": (-9.0, 9.0), "y'": (-4.0, 5.0)}, prices={"y": 1.0})
-    fp.write_report(compared("plain", limits=limits), tmp_path / "limited.html")
-    charts = {c["title"]: c for c in data_of((tmp_path / "limited.html").read_text(encoding="utf-8"))["charts"]}
-    shown = {title: (chart["unit"], chart["limits"]) for title, chart in charts.items() if "limits" in chart}
-    assert shown == {"y": ("m", []), "command u": ("N", [-20.0, None]), "y'": ("m/s", [-4.0, 5.0])}
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page(name, tmp_path):
+    """It fetches nothing, runs its own scripts alone, shows names as they are, and no peak of a chart is lost."""
+    wanted = PAGES[name]
+    found, path = wanted.found(), tmp_path / "report.html"
+    fp.write_report(found, path)
+    assert [one.name for one in tmp_path.iterdir()] == ["report.html"]
+    page = path.read_text(encoding="utf-8")
+    assert len(page) < 3_000_000
+    assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)|@import""", page)
+    own_scripts_alone(page)
+    assert "alert('x')</script>" not in page
+    assert [one for one in wanted.has if not re.search(one, page)] == []
+    said = re.sub(r"(?s)<(script|style)>.*?</\1>|data:image[^']*|took [\d.]+ s\.", " ", page)
+    assert [one for one in wanted.lacks if re.search(one, said)] == []
+    for text in (said, found._repr_html_()) if found.entries else ():
+        assert not re.search(r"<(b|bold)\b", text)
+        assert [one for one in wanted.shows if one not in html.unescape(text)] == []
+    assert "\x1b" not in repr(found)
+    charts_are_whole(found, page, wanted.ends)
+    with pytest.raises(OutputError, match="cannot write the report"):
+        fp.write_report(found, tmp_path / "missing" / "report.html")
 
 
-def test_a_controller_has_the_colour_of_its_place_in_the_file(written, tmp_path):
-    """Whichever others run, in whatever order; no two have the same one."""
-    fp.write_report(compared("exact", "adaptive"), tmp_path / "part.html")
-    both = (data_of(path.read_text(encoding="utf-8"))["controllers"] for path in (written, tmp_path / "part.html"))
-    whole, part = ({c["name"]: c["color"] for c in some} for some in both)
-    assert len({*whole.values()}) == 3
-    assert part == {name: whole[name] for name in ("exact", "adaptive")}
-
-
-def test_page_states_a_policy_that_allows_its_own_scripts_alone(written):
+def own_scripts_alone(page: str) -> None:
     """Every script is named by its hash, no source elsewhere is allowed, and the policy stands before all scripts."""
-    whole = written.read_text(encoding="utf-8")
-    [policy] = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', whole)
+    [policy] = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', page)
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
-    scripts = re.findall(r"<script>(.*?)</script>", whole, flags=re.DOTALL)
+    scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
     hashes = [f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts]
     assert rules["script-src"].split() == hashes
     assert rules["default-src"] == rules["base-uri"] == rules["form-action"] == "'none'"
     assert rules["img-src"] == "data:"
-    assert whole.index("Content-Security-Policy") < whole.index("<script")
+    assert page.index("Content-Security-Policy") < page.index("<script")
 
 
-def test_a_run_that_ends_early_is_told_in_words(comparison, tmp_path):
-    """Its numbers are 'none' and its reason is in the verdict; a comparison without a row says so; a folder must be there."""
-    entry = comparison["plain"]
-    short = replace(entry.run, log=entry.run.log[:300], stop="signal 'x' is not finite at t = 0.3 s")
-    ended = replace(entry, run=short, metrics=fp.measure(problem(), short))
-    fp.write_report(replace(comparison, entries=(ended, *comparison.entries[1:])), tmp_path / "ended.html")
-    page = (tmp_path / "ended.html").read_text(encoding="utf-8")
-    assert "does not finish: signal &#39;x&#39; is not finite" in page
-    assert "<td class='none'>none</td>" in page
-    none = replace(comparison, entries=(), skipped={"x": "because"}, description="  y = x")
-    fp.write_report(none, tmp_path / "empty.html")
-    empty = (tmp_path / "empty.html").read_text(encoding="utf-8")
-    assert ("No controller finished" in empty, "<pre class='about'>y = x</pre>" in empty) == (True, True)
-    with pytest.raises(OutputError, match="cannot write the report"):
-        fp.write_report(comparison, tmp_path / "missing" / "report.html")
+def charts_are_whole(found: Any, page: str, ends: dict[str, Any]) -> None:
+    """Each controller has the colour of its place in the file, also in pictures; errors have their extremes."""
+    begin = page.index("DATA", page.index('{"controllers"') - 20)
+    data = json.JSONDecoder().raw_decode(page[page.index("{", begin) :])[0]
+    assert [one["name"] for one in data["controllers"]] == [e.name for e in found.entries]
+    assert [one["color"] for one in data["controllers"] if COLOURS.get(one["name"], one["color"]) != one["color"]] == []
+    charts = {one["title"]: one for one in data["charts"]}
+    shown = {title: (chart["unit"], chart["limits"]) for title, chart in charts.items() if "limits" in chart}
+    assert shown == (ends or shown)
+    for entry in found.entries:
+        quantity = entry.run.layout["error"].elements[0]
+        [drawn] = [one["values"] for one in charts[f"error of {quantity}"]["series"] if one["name"] == entry.name]
+        assert len(drawn) == len(data["time"])
+        drawn, own = [v for v in drawn if v is not None], entry.run[f"error.{quantity}"]
+        assert (max(drawn), min(drawn)) == pytest.approx((own.max(), own.min()), rel=1e-4)
+    own = {e.name for e in found.entries} <= {*COLOURS}
+    for png in re.findall(r"data:image/png;base64,([^']*)'", page) if own else ():
+        pixels = imread(io.BytesIO(base64.b64decode(png)))[..., :3]
+        near = [np.abs(pixels - np.array(to_rgb(COLOURS[n]))).max(axis=-1).min() for n in ("adaptive", "plain")]
+        assert (near[0] < 0.15, near[1] > 0.3) == (True, True)
 
 
 def test_the_plot_of_a_run_names_quantities_units_and_controller():

@@ -33,7 +33,7 @@ def test_nothing_speaks_of_seconds(tmp_path, monkeypatch, capsys):
     Path("daily.py").write_text(SHORT)
     said = []
     study = "study daily.py --draws 2 --mismatch 5% --out results/study"
-    for command in ("compare daily.py", study, "review daily.py -c RHC"):
+    for command in (study, "review daily.py -c RHC"):
         assert main([*command.split(), *([] if "review" in command else ["--no-compile"])]) in (0, 1)
         said.append(ALLOWED.sub("", capsys.readouterr().out))
     said += [without_scripts(page.read_text(encoding="utf-8")) for page in Path("results").rglob("*.html")]
