@@ -48,11 +48,6 @@ class Wrong:
     code: int | None = None
 
 
-def one(file: str, old: str, new: str, *said: str) -> Wrong:
-    """One change, reviewed."""
-    return Wrong(file, ((old, new),), said)
-
-
 # Changes of a correct file: the name of the mistake, the old piece and the new one, and what must be said, in this order.
 WRONG_PENDULUM = """
 a number with its unit
@@ -164,6 +159,33 @@ parenthesis that stays open
   reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}), ->
       reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)},
     mine.py, line 23: '(' was never closed problem = fp.Problem(
+no input in the response
+  u.torque - p ->  - p
+    no input reaches coordinate 'angle' ... use torque in the response
+two inputs for one coordinate
+  {"torque": "N m"} -> {"torque": "N m", "brake": "N m"}
+  u.torque - p -> u.torque - u.brake - p
+    2 inputs (torque, brake) for 1 of the coordinates (angle): each input holds one ... leave an input out ... docs/plants.md
+a horizon that is not there
+  horizon=fp.Horizon(stages=6, step=2e-2), ->
+    no Does the controller fit the problem? -> RecedingHorizon needs Problem(horizon=...), which this problem does not have
+mistakes all over the file
+  import numpy as np -> import numpy as np; import do_mpc_
+  unit="kg" -> units="kg"
+  exact=0.6 -> exact="0.6"
+  period=1e-2 -> period="1e-2"
+  stages=6 -> n_horizon=6
+  gain=-2.6 -> gain="big"
+    line 3: import numpy as np; import do_mpc_ ModuleNotFoundError: No module named 'do_mpc_'
+key that is not there
+  optimiser = fp -> n = {}['max_iter']; optimiser = fp
+    mine.py, line 34: n = {}['max_iter'] ... KeyError: 'max_iter'
+data that are not there
+  optimiser = fp -> table = np.loadtxt("gone.csv"); optimiser = fp
+    line 34: table = np.loadtxt ... gone.csv not found
+everything in a function
+  problem = fp.Problem( -> def main(): problem = fp.Problem(
+    it must define problem = fpirhc.Problem(...), outside every function
 """
 WRONG_REACTOR = """
 rates of time
@@ -184,67 +206,17 @@ weights of states behind an output
     weigh temperature, Quadratic(outputs=...)
 """
 OTHERS = {
-    "no input in the response": one(
-        PENDULUM, "u.torque - ", "0 - ", "no input reaches coordinate 'angle'", "use torque in the response"
-    ),
-    "two inputs for one coordinate": Wrong(
-        PENDULUM,
-        (('{"torque": "N m"}', '{"torque": "N m", "brake": "N m"}'), ("u.torque - ", "u.torque - u.brake - ")),
-        (
-            "2 inputs (torque, brake) for 1 of the coordinates (angle): each input holds one",
-            "leave an input out",
-            "docs/plants.md",
-        ),
-    ),
-    "a horizon that is not there": one(
-        PENDULUM,
-        "    horizon=fp.Horizon(stages=6, step=2e-2),\n",
-        "",
-        "no Does the controller fit the problem? -> RecedingHorizon needs Problem(horizon=...), which this problem does not have",
-    ),
-    "mistakes all over the file": Wrong(
-        PENDULUM,
-        (
-            ("import numpy as np\n", "import numpy as np\nimport do_mpc_\n"),
-            ('unit="kg"', 'units="kg"'),
-            ("exact=0.6", 'exact="0.6"'),
-            ("period=1e-2", 'period="1e-2"'),
-            ("stages=6", "n_horizon=6"),
-            ("gain=-2.6", 'gain="big"'),
-        ),
-        ("line 4: import do_mpc_ ModuleNotFoundError: No module named 'do_mpc_'",),
-    ),
-    "key that is not there": one(
-        PENDULUM,
-        "optimiser = fp",
-        "n = {}['max_iter']\noptimiser = fp",
-        "mine.py, line 34: n = {}['max_iter'] KeyError: 'max_iter'",
-    ),
-    "data that are not there": one(
-        PENDULUM,
-        "optimiser = fp",
-        'table = np.loadtxt("gone.csv")\noptimiser = fp',
-        "line 34: table = np.loadtxt",
-        "gone.csv not found",
-    ),
-    "everything in a function": one(
-        PENDULUM,
-        "problem = fp.Problem(",
-        "def main():\n  problem = fp.Problem(",
-        "it must define problem = fpirhc.Problem(...), outside every function",
-    ),
-    "circular imports": Wrong(
+    f"a neighbour, {words}": Wrong(
         PENDULUM,
         (("import fpirhc as fp", "import fpirhc as fp\nfrom helper import LENGTH"),),
-        ("mine.py, line 5: from helper import LENGTH", "circular import"),
-        beside={"helper.py": "from mine import response\nLENGTH = 1.0\n"},
-    ),
-    "name that a neighbour lacks": Wrong(
-        PENDULUM,
-        (("import fpirhc as fp", "import fpirhc as fp\nfrom helper import LENGTH"),),
-        ("mine.py, line 5", "ImportError: cannot import name 'LENGTH' from 'helper'"),
-        beside={"helper.py": "LENGHT = 1.0\n"},
-    ),
+        ("mine.py, line 5", words),
+        beside={"helper.py": text},
+    )
+    for text, words in (
+        ("from mine import response\nLENGTH = 1.0\n", "circular import"),
+        ("LENGHT = 1.0\n", "ImportError: cannot import name 'LENGTH' from 'helper'"),
+    )
+} | {
     "equations of MATLAB": Wrong("function dx = f(t, x)\n", (), ("mine.py, line 1: invalid syntax",)),
     "nothing": Wrong("", (), ("it must define problem = fpirhc.Problem(...)", "it must define controllers = {")),
 }
