@@ -8,7 +8,8 @@ import pytest
 os.environ.setdefault("FPIRHC_CFLAGS", "-O0")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a job in the background of a shell; tests interrupt processes
     signal.signal(signal.SIGINT, signal.default_int_handler)
-AS_SHIPPED = ("tests/symbolic/", "tests/optimisers/test_loops_in_c")
+LOOPS = ("matrices_of_many", "converging_loops_stop", "no_loop_leaves")
+AS_SHIPPED = ("tests/symbolic/", *(f"tests/optimisers/test_loops_in_c.py::test_{name}" for name in LOOPS))
 
 
 @pytest.fixture(autouse=True)

@@ -57,23 +57,18 @@ def test_adjoint_gradient_agrees_with_finite_differences(name, discretisation):
         assert slope[0, k] == pytest.approx((high - low) / 2e-5, rel=1e-5, abs=1e-7)
 
 
-def test_terms_add_up_to_the_cost():
-    ocp, data = built(COSTS["rate"])
-    s0, inputs = point(ocp)
-    run = rolled(ocp, s0, inputs, data)
-    final = float(ocp.terminal_cost(run.states[:, -1], data[:, -1]))
-    assert ocp.terms == ("states", "effort", "rate")
-    assert run.cost == pytest.approx(run.terms.sum() + final)
-
-
 def test_rate_cost_counts_the_change_from_the_last_command():
-    """The previous input is part of the stage's state; holding it costs nothing."""
+    """The previous input is part of the stage's state; holding it costs nothing. Terms add up to the cost."""
     ocp, data = built(fp.Quadratic(states={"angle": 0.0}, rate={"torque": 2.0}))
     first = np.array([0.1, 0.0, 0.7])
     held = rolled(ocp, first, np.full((1, ocp.stages), 0.7), data)
     jump = rolled(ocp, first, np.full((1, ocp.stages), 1.7), data)
     assert held.cost == 0.0
     assert jump.cost == pytest.approx(2.0 * ocp.step)
+    ocp, data = built(COSTS["rate"])
+    run = rolled(ocp, *point(ocp), data)
+    assert ocp.terms == ("states", "effort", "rate")
+    assert run.cost == pytest.approx(run.terms.sum() + float(ocp.terminal_cost(run.states[:, -1], data[:, -1])))
 
 
 def test_lqr_terminal_makes_a_short_horizon_endless():
@@ -100,6 +95,8 @@ BAD_COSTS = {
         "end .* has no input",
     ),
     "lqr": (fp.Quadratic(states={"angle": 1.0}, terminal=fp.LQRTerminal()), "needs a positive effort"),
+    # Two of one name were one, and a cost or a limit was lost.
+    "twice": (fp.CustomCost(lambda v: {"held": v.state.angle**2 + v.input.torque**2}), "term 'held' has the name of"),
     "many": (fp.Quadratic(states={"angel": 1.0, "angle": 1.0}, effort={"torqe": 1.0}), "2 mistakes"),
 }
 
@@ -107,19 +104,9 @@ BAD_COSTS = {
 @pytest.mark.parametrize("case", BAD_COSTS)
 def test_mistakes_of_a_cost(case):
     cost, message = BAD_COSTS[case]
-    horizon = fp.Horizon(stages=3, step=0.1)
+    horizon = fp.Horizon(stages=3, step=0.1, blocks=(1, 2))
     with pytest.raises(InvalidProblem, match=message):
         horizon_of(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), horizon, cost)
-
-
-def named(name):
-    return lambda v: {name: v.state.angle**2 + v.input.torque**2}
-
-
-def test_a_term_has_no_name_of_another_one():
-    """Two of one name were one, and a cost or a limit was lost."""
-    with pytest.raises(InvalidProblem, match="term 'held' has the name of"):
-        built(fp.CustomCost(terms=named("held")), fp.Horizon(3, 0.1, blocks=(1, 2)))
 
 
 def test_curvature_is_the_bend_of_the_cost_along_the_first_input():
@@ -327,15 +314,11 @@ def test_a_run_has_its_cost_whatever_the_stages_are():
 # best steady state is c_A = c_B = 1/2 mol/l at Q = 12 l/min; their regularisation is .505 times the squared distance from it, which
 # makes it optimal for the dynamic problem too.
 REACTOR = fp.Plant(
-    coordinates={"cA": "mol/l", "cB": "mol/l"},
-    inputs={"Q": "l/min"},
+    {"cA": "mol/l", "cB": "mol/l"},
+    {"Q": "l/min"},
+    {"k": fp.Parameter(1.2, 1.2, "1/min"), "V": fp.Parameter(10.0, 10.0, "l"), "feed": fp.Parameter(1.0, 1.0, "mol/l")},
+    lambda q, u, p: {"cA": u.Q / p.V * (p.feed - q.cA) - p.k * q.cA, "cB": -u.Q / p.V * q.cB + p.k * q.cA},
     order=1,
-    parameters={
-        "k": fp.Parameter(1.2, 1.2, "1/min"),
-        "V": fp.Parameter(10.0, 10.0, "l"),
-        "feed": fp.Parameter(1.0, 1.0, "mol/l"),
-    },
-    response=lambda q, u, p: {"cA": u.Q / p.V * (p.feed - q.cA) - p.k * q.cA, "cB": -u.Q / p.V * q.cB + p.k * q.cA},
     controlled=("cB",),
     time_unit="min",
 )

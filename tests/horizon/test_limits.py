@@ -229,28 +229,25 @@ def upright(length, horizon, limits):
 PLANNED = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-4))
 
 
-def test_a_plant_that_runs_away_itself_is_planned_with_states_of_its_own():
-    """It multiplies a motion by 1e10 over the horizon; with limits of states the plans are those of IPOPT."""
-    problem = upright(0.25, 4.0, {"a": (-0.5, 0.5)})
-    run = fp.simulate(problem, PLANNED, seed=0)
-    other = fp.simulate(problem, fp.RecedingHorizon(fp.Ipopt(tolerance=1e-8)), seed=0)
-    assert set(fp.measure(problem, run).statuses) == {"OK"}
-    np.testing.assert_allclose(run["state"], other["state"], atol=1e-4)
+@pytest.mark.parametrize(("horizon", "limits"), [(1.6, {}), (3.0, {}), (4.0, {}), (4.0, {"a": (-0.5, 0.5)})])
+def test_a_plant_that_runs_away_itself_is_planned(horizon, limits):
+    """It multiplies a motion by 1e10 over the horizon: every plan, the first one too, is that of IPOPT and OK.
 
-
-@pytest.mark.parametrize("horizon", [1.6, 3.0, 4.0])
-def test_a_plant_that_runs_away_itself_is_planned_without_them(horizon):
-    """Every plan, the first one too, is that of IPOPT and OK: a plan that lets the pendulum fall does not look stationary."""
-    problem = upright(0.25, horizon, {})
+    A plan that lets the pendulum fall does not look stationary.
+    """
+    problem = upright(0.25, horizon, limits)
     ocp, first, data = posed(problem)
     for tolerance in (1e-4, 1e-8):
         plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=tolerance), first, data)
         best = fp.solve(ocp, fp.Ipopt(tolerance=1e-8), first, data)
         assert plan.status is best.status is fp.Status.OK
-        assert plan.cost == pytest.approx(best.cost, rel=1e-6)
+        deeper = bool(limits) and known(plan.cost) < known(
+            best.cost
+        )  # between limits IPOPT ends in another valley at first
+        assert deeper or plan.cost == pytest.approx(best.cost, rel=1e-6)
     judged = judge(ocp)(np.zeros((1, ocp.stages)), first, data, -20.0, 20.0, np.zeros((2, ocp.stages)))
     assert float(judged[1]) > 1.0  # N m, of the plan without torque
-    run = fp.simulate(problem, PLANNED, seed=0, compiled=False)
+    run = fp.simulate(problem, PLANNED, seed=0, compiled=bool(limits))
     other = fp.simulate(problem, fp.RecedingHorizon(fp.Ipopt(tolerance=1e-8)), seed=0, compiled=False)
     assert set(fp.measure(problem, run).statuses) == {"OK"}
     np.testing.assert_allclose(run["state"], other["state"], atol=1e-4)
@@ -304,45 +301,21 @@ def largest(limits: fp.Limits, lengths: tuple[float, ...] = ()) -> float:
 
 @pytest.mark.parametrize("name", ["state", "path", "output"])
 @pytest.mark.parametrize("lengths", [(), (1.0, 2.0, 1.0)], ids=["equal", "longer"])
-def test_hard_limits_hold_at_every_step(name, lengths):
+def test_hard_limits_hold_at_every_step_and_priced_ones_at_the_nodes_alone(name, lengths):
     """The limit is met exactly, so it is the one that binds the plan."""
     assert largest(LIMITED[name], lengths) == pytest.approx(MOST, abs=1e-6)
-
-
-def test_priced_limits_hold_at_the_nodes_alone():
     assert largest(LIMITED["priced"]) > 1.5 * MOST
 
 
-# Margins
-TRACK = 0.8
-
-
-def carriage(mass: float = 1.0, believed: float = 1.3) -> fp.Problem:
-    """A carriage on a track that is shorter than what it is to follow."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"F": "N"},
-        response=lambda q, v, u, p: {"q": (u.F - 2.0 * q.q - 0.4 * v.q) / p.m},
-        parameters={"m": fp.Parameter(believed, mass, "kg")},
-    )
-    limits = fp.Limits(inputs={"F": (-20.0, 20.0)}, states={"q": (-TRACK, TRACK), "q'": (-2.5, 2.5)})
-    cost = fp.Quadratic(states={"q": 100.0, "q'": 1.0}, effort={"F": 1e-3})
-    more = {"limits": limits, "horizon": fp.Horizon(stages=20, step=0.05), "cost": cost, "measure_from": 1.0}
-    moved = fp.Trajectory(lambda t: {"q": ca.sin(2 * t)})
-    return fp.Problem(plant, moved, {"q": 0.0, "q'": 2.0}, period=0.01, duration=3.5, **more)
-
-
-def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_margin_narrows_the_plan_by_its_number_at_every_stage(side):
     """On the bound less the margin where the limit is active, like IPOPT's plan with the same margin."""
-    margin, problem = 0.13, carriage()
-    horizon = replace(problem.horizon, margins={"q": margin})
-    ocp, _, data = posed(replace(problem, horizon=horizon), time=0.3)
-    first = np.asarray(ocp.start([0.55, 1.4], [0.0]).full()).ravel()
-    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-7), first, data)
+    ocp, data = pendulum_problem(limits=CASES["state and input"], horizon=replace(HORIZON, margins={"angle'": 0.13}))
+    first = ocp.start(side * FIRST, [0.0]).full().ravel()
+    plan, other = fp.solve(ocp, FIXED, first, data), fp.solve(ocp, fp.Ipopt(tolerance=1e-9), first, data)
     assert plan.status == fp.Status.OK
-    room = TRACK - margin - np.asarray(plan.states)[0, 1:]
+    room = (0.2 if side > 0 else 0.5) - 0.13 + side * plan.states[1, 1:]
     assert room.min() == pytest.approx(0.0, abs=1e-5)
-    other = fp.solve(ocp, fp.Ipopt(tolerance=1e-9), first, data)
     assert plan.cost == pytest.approx(other.cost, rel=1e-4)
 
 
@@ -350,11 +323,7 @@ def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
 def test_the_rate_of_a_plan_counts_from_the_command_without_its_shift(weights):
     """A constant force that the model lacks: with the shift in its rate, a plan would pay for it for ever and stay off."""
     plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"F": "N"},
-        order=1,
-        response=lambda q, u, p: {"q": u.F - q.q + p.d},
-        parameters={"d": fp.Parameter(0.0, 2.0, "N")},
+        {"q": "m"}, {"F": "N"}, {"d": fp.Parameter(0.0, 2.0, "N")}, lambda q, u, p: {"q": u.F - q.q + p.d}, order=1
     )
     still, horizon = fp.Trajectory(lambda t: {"q": 0 * t}), fp.Horizon(stages=20, step=0.05)
     more = {"horizon": horizon, "cost": fp.Quadratic(states={"q": 10.0}, **weights), "duration": 6.0}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from math import sin, sqrt
 from typing import Any
 
@@ -27,29 +28,26 @@ def call(optimiser, ocp, data, first, memory=None, bounds=None):
     return plan, numbers[:, 0], after
 
 
+@cache
+def swung() -> Any:
+    (ocp, data), optimiser = pendulum_problem(), fp.FixedPointSolver(iterations=25, tolerance=1e-8)
+    return ocp, data, optimiser.step(ocp), optimiser.memory(ocp).start(), judge(ocp)
+
+
 @settings(deadline=None, derandomize=True, max_examples=200)
 @given(seed=st.integers(0, 10**6), low=st.floats(-3, 0), high=st.floats(0, 3))
 def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, high):
     """Whatever is told is what an independent judge finds; the box is kept; and most are solved."""
-    ocp, data = CACHE["ocp"]
+    ocp, data, step, rest, judged = swung()
     bounds = np.array([low]), np.array([high])
     first = np.random.default_rng(seed).normal(size=2) * 2
-    inputs, diagnostics, _ = (v.full() for v in CACHE["step"](first, data, *bounds, CACHE["memory"]))
-    cost, residual, _ = (float(v) for v in CACHE["judge"](inputs, first, data, *bounds, np.zeros((2, ocp.stages))))
+    inputs, diagnostics, _ = (v.full() for v in step(first, data, *bounds, rest))
+    cost, residual, _ = (float(v) for v in judged(inputs, first, data, *bounds, np.zeros((2, ocp.stages))))
     assert diagnostics.ravel()[0] == pytest.approx(cost, rel=1e-10)
     assert diagnostics.ravel()[1] == pytest.approx(residual, rel=1e-6, abs=1e-11)
     assert (diagnostics.ravel()[4] == fp.Status.OK) == (diagnostics.ravel()[1] <= 1e-8)
     assert diagnostics.ravel()[4] == fp.Status.OK
     assert low <= inputs.min() <= inputs.max() <= high
-
-
-CACHE: dict[str, Any] = {}
-
-
-def setup_module():
-    ocp, data = pendulum_problem()
-    optimiser = fp.FixedPointSolver(iterations=25, tolerance=1e-8)
-    CACHE.update(ocp=(ocp, data), step=optimiser.step(ocp), memory=optimiser.memory(ocp).start(), judge=judge(ocp))
 
 
 def moved(response, horizon, cost, limits=None, at=0.0):
@@ -168,10 +166,10 @@ def test_feedback_keeps_unstable_plants_together():
 def test_a_second_start_takes_the_iterations_of_both():
     """Those of a call with the remembered plan and of one without, and the plan that is cheaper."""
     one, box = fp.FixedPointSolver(iterations=4, tolerance=1e-8), ([-3.0], [3.0])
-    memory, two = call(one, *CACHE["ocp"], np.array([4.0, 4.0]), bounds=box)[2], replace(one, second_start=True)
+    memory, two = call(one, *swung()[:2], np.array([4.0, 4.0]), bounds=box)[2], replace(one, second_start=True)
     for state in ([2.0, 0.0], [0.5, 0.0]):  # the remembered plan is the cheaper one, and the other one is
         ways = (one, memory), (one, None), (two, memory)
-        warm, cold, both = (call(o, *CACHE["ocp"], np.array(state), m, box)[1] for o, m in ways)
+        warm, cold, both = (call(o, *swung()[:2], np.array(state), m, box)[1] for o, m in ways)
         assert [*both[[0, 3, 4]]] == [min(warm[0], cold[0]), warm[3] + cold[3], fp.Status.OK]
 
 
@@ -225,23 +223,17 @@ def test_of_two_starts_the_plan_that_costs_less_with_its_violations_is_taken(sid
 PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "two_link_arm", "chain_of_masses")
 
 
-def iterates(ocp, data, first, count):
-    """Plans after 1, 2, ... iterations from rest."""
-    optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-13)
-    best = fp.solve(ocp, replace(optimiser, tolerance=1e-9), first, data)
-    for inputs, numbers in repeated(optimiser, ocp, data, first, count):
-        yield replace(best, inputs=inputs, states=best.states, cost=float(numbers[0])), best
-
-
 @pytest.mark.parametrize("name", slow_but(PROBLEMS, "two_mass", "cart_pole"))
 def test_no_bound_is_below_the_true_error(name):
     """On early and late iterates of every shipped problem: distance to the optimum, error of any input, and suboptimality."""
     ocp, first, data = posed(fp.load_problem(name).problem)
-    counted = 0
-    for k, (plan, best) in enumerate(iterates(ocp, data, first, 14)):
+    optimiser, counted = fp.FixedPointSolver(iterations=1, tolerance=1e-13), 0
+    best = fp.solve(ocp, replace(optimiser, tolerance=1e-9), first, data)
+    for k, (inputs, numbers) in enumerate(repeated(optimiser, ocp, data, first, 14)):
         if k not in {0, 1, 2, 3, 5, 8, 13}:
             continue
-        plan = replace(plan, states=rolled(ocp, first, plan.inputs, data).states)
+        states = rolled(ocp, first, inputs, data).states
+        plan = replace(best, inputs=inputs, states=states, cost=float(numbers[0]))
         certificate = fp.certify(plan)
         if not np.isfinite(certificate.input_error):
             continue

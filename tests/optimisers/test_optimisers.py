@@ -1,6 +1,5 @@
 """Optimisers: every plan is stationary or says that it is not; all find the same optimum, on the shipped problems too."""
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -8,9 +7,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.horizons import horizon_of, linear_problem, pendulum_problem, repeated
+from helpers.horizons import COST, horizon_of, linear_problem, pendulum_problem, repeated
 from helpers.kinds import slow_but
-from helpers.plants import known, pendulum
+from helpers.plants import known
 
 import fpirhc as fp
 from fpirhc.conformance import posed
@@ -187,14 +186,6 @@ def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
         assert costs[0] <= 1.01 * costs[1]
 
 
-def test_indefinite_costs_are_refused_with_what_to_use_instead():
-    """A cost that bends downwards has no quadratic model with a minimum."""
-    cost = fp.CustomCost(terms=lambda v: {"down": -(v.state.angle**2), "effort": v.input.torque**2})
-    ocp, _ = horizon_of(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), fp.Horizon(5, 0.1), cost)
-    with pytest.raises(fp.FpirhcError, match=r"bends upwards.*Use ReducedGradient"):
-        fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-6), np.zeros(2), np.zeros((ocp.data.size, 6)))
-
-
 def test_a_first_plan_at_its_limits_alone_is_sought_again():
     """A valve of the tanks 10 % off: from no input the search ends at an empty tank, in which no pump has an effect."""
     task = fp.load_problem("leaking_tanks")
@@ -212,23 +203,6 @@ def test_a_first_plan_at_its_limits_alone_is_sought_again():
     run = fp.simulate(problem, task.controllers["RHC"], seed=0, compiled=False)
     assert run["command"].min() > 40.0
     assert fp.measure(problem, run).rms_error["h2"] < 0.03
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "text"),
-    [
-        ({"state": np.zeros(3)}, InvalidValue, "state has the shape (3,), expected (4,)"),
-        ({"data": np.zeros((2, 2))}, InvalidValue, "data has the shape (2, 2), expected"),
-        ({"start": np.zeros((3, 3))}, InvalidValue, "start has the shape (3, 3), expected (2, 20)"),
-        ({"state": np.full(4, np.nan)}, InvalidValue, "state is not finite"),
-    ],
-)
-def test_what_is_solved_has_its_shape(change, error, text):
-    ocp, first, data = posed(fp.load_problem("two_mass").problem)
-    optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-8)
-    every = {"state": first, "data": data, **change}
-    with pytest.raises(error, match=re.escape(text)):
-        fp.solve(ocp, optimiser, every.pop("state"), every.pop("data"), **every)
 
 
 # The published optimiser and its reduced form: what they promise, and why the default is another one
@@ -292,19 +266,6 @@ def test_the_baseline_is_orders_of_magnitude_slower_and_scaling_helps():
     left = [fp.solve(ocp, one, FIRST, data, calls=1).stationarity or 0.0 for one in kinds]
     assert left[0] > left[1] > 1e-6
     assert fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-6), FIRST, data).iterations < 10
-
-
-def test_what_the_baselines_do_not_serve_is_refused():
-    """Each says who can."""
-    ocp, data = pendulum_problem(limits=fp.Limits(inputs={"torque": (-1.0, 1.0)}))
-    with pytest.raises(NotSupported, match="for limits use FixedPointSolver"):
-        fp.solve(ocp, fp.FullSpaceFixedPoint(iterations=1, tolerance=1e-6), FIRST, data)
-    ocp, data = pendulum_problem(limits=fp.Limits(states={"angle": (-1.0, 1.0)}))
-    with pytest.raises(NotSupported, match="FixedPointSolver"):
-        fp.solve(ocp, fp.GradientFixedPoint(iterations=1, tolerance=1e-6), FIRST, data)
-    ocp, data = pendulum_problem()
-    with pytest.raises(NotContractive, match="outside"):
-        fp.solve(ocp, fp.FullSpaceFixedPoint(iterations=1, tolerance=1e-6, map=fp.Affine(gain=-1.0)), FIRST, data)
 
 
 # Status OK is a promise about the plan that is sent: on an unstable plant a plan that is not solved says so
@@ -398,3 +359,32 @@ def test_plans_with_the_exact_model_begin_with_the_parameters_of_their_run(name,
         np.testing.assert_allclose(one["command"][0], other["command"][0], rtol=0, atol=1e-6 * tolerance)
         np.testing.assert_allclose(one["command"], other["command"], rtol=0, atol=tolerance)
         np.testing.assert_array_equal(one["status"], other["status"])
+
+
+# Refusals, and who can
+DOWN = fp.CustomCost(terms=lambda v: {"down": -(v.state.angle**2), "effort": v.input.torque**2})
+FULL, PUSHED, SWUNG = fp.FullSpaceFixedPoint(1, 1e-6), {"torque": (-1.0, 1.0)}, {"angle": (-1.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "changes", "error", "words"),
+    [
+        (FIXED, {"state": np.zeros(3)}, InvalidValue, r"state has the shape \(3,\), expected \(2,\)"),
+        (FIXED, {"data": np.zeros((2, 2))}, InvalidValue, r"data has the shape \(2, 2\), expected"),
+        (FIXED, {"start": np.zeros((3, 3))}, InvalidValue, r"start has the shape \(3, 3\), expected \(1, 12\)"),
+        (FIXED, {"state": np.full(2, np.nan)}, InvalidValue, "state is not finite"),
+        (
+            FIXED,
+            {"cost": DOWN},
+            fp.FpirhcError,
+            r"bends upwards.*Use ReducedGradient",
+        ),  # it has no model with a minimum
+        (FULL, {"limits": fp.Limits(inputs=PUSHED)}, NotSupported, "for limits use FixedPointSolver"),
+        (fp.GradientFixedPoint(1, 1e-6), {"limits": fp.Limits(states=SWUNG)}, NotSupported, "FixedPointSolver"),
+        (replace(FULL, map=fp.Affine(gain=-1.0)), {}, NotContractive, "outside"),
+    ],
+)
+def test_what_an_optimiser_does_not_serve_is_refused(optimiser, changes, error, words):
+    ocp, data = pendulum_problem(changes.pop("cost", COST), changes.pop("limits", None))
+    with pytest.raises(error, match=words):
+        fp.solve(ocp, optimiser, **{"state": FIRST, "data": data} | changes)

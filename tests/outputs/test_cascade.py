@@ -106,8 +106,6 @@ def test_without_adaptation_it_is_what_it_is_around():
 
 
 # A cascade on outputs that are expressions of the state, and its way back from a limit
-
-
 LAW = fp.ComputedTorque(fp.Exponential(rate=1.0))
 
 
@@ -167,12 +165,8 @@ def heated(plant: fp.Plant, **settings: Any) -> fp.Problem:
     return fp.Problem(plant=plant, **{**values, **settings})
 
 
-def rms_of(problem: fp.Problem, run: fp.Run, name: str) -> float:
-    return float(fp.measure(problem, run).rms_error[name])
-
-
 def rms(problem: fp.Problem, controller: Controller) -> float:
-    return rms_of(problem, simulated(problem, controller), "power")
+    return float(fp.measure(problem, simulated(problem, controller)).rms_error["power"])
 
 
 def test_the_order_is_found_from_the_symbols() -> None:

@@ -55,17 +55,12 @@ def test_an_output_that_is_only_judged_is_measured_and_not_controlled() -> None:
 
 # What is refused, and how
 
-DOUBLE: dict[str, Any] = {
-    "states": {"a": "m", "b": "m/s"},
-    "inputs": {"u": "N"},
-    "parameters": {},
-    "rates": lambda x, u, p: {"a": x.b, "b": u.u},
-}
-
 
 def double(outputs: dict[str, fp.Output], **settings: Any) -> fp.Plant:
     """Two integrators with some outputs."""
-    return fp.Plant.of_states(**{**DOUBLE, **settings}, outputs=outputs)
+    usual: dict[str, Any] = {"states": {"a": "m", "b": "m/s"}, "inputs": {"u": "N"}, "parameters": {}}
+    usual["rates"] = lambda x, u, p: {"a": x.b, "b": u.u}
+    return fp.Plant.of_states(**usual | settings, outputs=outputs)
 
 
 SQUARE = {"y": fp.Output("m^2", lambda x, p: x.a**2)}
@@ -73,10 +68,8 @@ SQUARE = {"y": fp.Output("m^2", lambda x, p: x.a**2)}
 
 def squared(motion: Callable[[Any], Any], **settings: Any) -> fp.Problem:
     """Y = a^2."""
-    return fp.Problem(
-        plant=double(SQUARE), reference=fp.Trajectory(lambda t: {"y": motion(t)}), start={"a": 1.0, "b": 0.0}, period=1e-2,
-        duration=4.0, **settings,
-    )  # fmt: skip
+    follows = fp.Trajectory(lambda t: {"y": motion(t)})
+    return fp.Problem(double(SQUARE), follows, {"a": 1.0, "b": 0.0}, 1e-2, 4.0, **settings)
 
 
 WRONG: dict[str, tuple[Callable[[], object], str]] = {
@@ -192,9 +185,6 @@ def test_computed_torque_on_the_hand_is_inverse_kinematics_by_hand(form: str) ->
     assert np.abs(run["command"] - torques).max() < 1e-10
 
 
-# Rivals on plants with outputs: those whose idea is about errors follow outputs; the others say why they do not
-
-
 def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:
     """The first request after a step of the model: its response to the last command plus the change, less its own drift."""
     problem = replace(circle(arm()), duration=0.1, measure_from=0.0)
@@ -263,35 +253,17 @@ def late(problem: fp.Problem, time: float = LATE) -> fp.Problem:
     return replace(problem, dead_time=fp.DeadTime(inputs={"u": time}))
 
 
-def scaled(gain: float) -> Callable[..., Any]:
-    return lambda q, v, p: gain * q.x
-
-
-def waved(gain: float) -> Callable[..., Any]:
-    return lambda t: {"y": gain * ca.sin(t)}
-
-
 def test_the_residual_of_an_output_is_the_forcing_that_makes_it_up() -> None:
     """Y = 3 x of a tank with a wrong leak: the residual of y'' acts on the state as a third of it, as if x had been measured."""
-    runs = []
-    for gain, time in ((1.0, 0.5), (3.0, 0.5), (1.0, None)):
-        plant = fp.Plant(
-            coordinates={"x": "m"},
-            inputs={"u": "N"},
-            parameters={"a": fp.Parameter(1.0, 2.0, "1")},
-            response=lambda q, v, u, p: {"x": u.u - p.a * q.x},
-            outputs={"y": fp.Output("m", scaled(gain))},
-        )
-        problem = fp.Problem(
-            plant=plant,
-            reference=fp.Trajectory(waved(gain)),
-            start={"x": 0.0, "x'": 1.0},
-            period=0.02,
-            duration=6.0,
-            measure_from=4.0,
-            dead_time=fp.DeadTime(inputs={"u": 0.1}),
-        )
-        runs.append(simulated(problem, fp.Predicted(fp.ComputedTorque(LAW), inputs=0.1, residual_time=time)))
+
+    def run_of(gain: float, time: float | None) -> fp.Run:
+        leak, output = {"a": fp.Parameter(1.0, 2.0, "1")}, fp.Output("m", lambda q, v, p: gain * q.x)
+        plant = fp.Plant({"x": "m"}, {"u": "N"}, leak, lambda q, v, u, p: {"x": u.u - p.a * q.x}, outputs={"y": output})
+        waved, late = fp.Trajectory(lambda t: {"y": gain * ca.sin(t)}), fp.DeadTime(inputs={"u": 0.1})
+        problem = fp.Problem(plant, waved, {"x": 0.0, "x'": 1.0}, 0.02, 6.0, measure_from=4.0, dead_time=late)
+        return simulated(problem, fp.Predicted(fp.ComputedTorque(LAW), inputs=0.1, residual_time=time))
+
+    runs = [run_of(1.0, 0.5), run_of(3.0, 0.5), run_of(1.0, None)]
     for signal in ("command", "state_ahead"):
         assert runs[1][signal] == pytest.approx(runs[0][signal], rel=1e-6, abs=1e-9)
     missed = [np.abs(run["state_ahead"][200:-5] - run["plant_state"][205:]).max() for run in runs]

@@ -38,12 +38,9 @@ def test_inverse_undoes_response(plant):
         np.testing.assert_allclose(back.full().ravel(), r, rtol=1e-12, atol=1e-12, equal_nan=False)
 
 
-def test_state_is_derivative_major():
-    assert two_mass_chain(("b",)).state.elements == ("a", "b", "a'", "b'")
-
-
-def test_mixed_orders():
+def test_states_are_derivative_major_and_orders_mix():
     """Orders are data: a coordinate of order 1 has no velocity in the state."""
+    assert two_mass_chain(("b",)).state.elements == ("a", "b", "a'", "b'")
     plant = fp.Plant(
         {"a": "m", "b": "rad"},
         {"u": "N", "w": "N"},
@@ -76,12 +73,6 @@ def test_published_inertia_and_gravity_load_of_the_puma():
     np.testing.assert_allclose(gravity, [0, 31.6399, 6.0351, 0, 0.0283, 0], atol=6e-5)
 
 
-# The same physics in another unit has the same answer
-
-
-LAW = fp.ComputedTorque(fp.Exponential(rate=1.0, integral=False))
-
-
 @pytest.mark.parametrize("unit", [1.0, 1e-15, 1e9])
 @pytest.mark.parametrize("size", [1.0, 1e-12, 1e9])
 def test_an_input_found_by_newtons_method_is_that_of_the_response_in_another_unit(size, unit):
@@ -111,50 +102,6 @@ def acting(second: Any, start: float) -> fp.Problem:
     )
     reference = fp.Trajectory(lambda t: {"first": ca.sin(t), "second": 1 + ca.sin(t)})
     return fp.Problem(plant, reference, {"a": start, "b": start}, period=0.01, duration=1.0)
-
-
-GOOD: dict[str, Any] = {
-    "coordinates": {"y": "m"},
-    "inputs": {"u": "N"},
-    "parameters": TWO,
-    "response": lambda q, v, u, p: {"y": u.u / p.m},
-}
-BAD: dict[str, dict[str, Any]] = {
-    "has no unit": {"parameters": {**TWO, "m": fp.Parameter(1.0, 1.0, "")}},
-    "Did you mean 'm'": {"response": lambda q, v, u, p: {"y": u.u / p.mm}},
-    "does not give the derivative y''": {"response": lambda q, v, u, p: {}},
-    "coordinate 'z' is unknown": {"response": lambda q, v, u, p: {"y": u.u, "z": u.u}},
-    "order must be a whole number": {"order": 0},
-    "order is 1000000000, and the highest possible is 20": {"order": 10**9},
-    "must be one scalar": {"response": lambda q, v, u, p: {"y": ca.vertcat(u.u, u.u)}},
-    "'y' names both an input and a coordinate; rename one": {"inputs": {"y": "N"}},
-}
-HARD: dict[str, Any] = {
-    "number 4": lambda: two_mass_chain(("a",)),
-    "controlled=": lambda: two_mass_chain().controlled_names,
-    r"3 inputs \(left, right, bow\).*by weights.*docs/plants.md": lambda: several(
-        {"left": "N", "right": "N", "bow": "N"},
-        lambda q, v, u, p: {"x": u.left + u.right + u.bow, "heading": u.right - u.left},
-    ),
-    "'v' has no independent effect there; .* control what follows from the rate of b": lambda: acting(
-        lambda x, _: 2 * x.a, 0.0
-    ),
-    "'v' has no independent effect there; start elsewhere": lambda: acting(lambda x, _: x.b**2, 0.0),
-    "2 mistakes.*approximate.*unit": lambda: fp.Plant(
-        {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(float("inf"), 1.0, "")}, lambda q, v, u, p: {"y": u.u}
-    ),
-    "expected a whole number from 1 to": lambda: fp.RungeKutta4(0),
-}
-
-
-@pytest.mark.parametrize("message", [*BAD, *HARD])
-def test_mistakes_are_named(message):
-    if message in HARD:
-        with pytest.raises(fp.FpirhcError, match=rf"(?s){message}"):
-            HARD[message]()
-        return
-    with pytest.raises(fp.FpirhcError, match=r"(?s)" + message.replace("(", r"\(")):
-        fp.Plant(**{**GOOD, **BAD[message]})
 
 
 # Integrators: order of convergence, and methods of scipy that control their error
@@ -218,17 +165,10 @@ def test_a_stiff_plant_is_sent_to_collocation_which_follows_it():
     np.testing.assert_allclose(x, _truth(STIFF, [0.5, 0.0], [0.1], 1.0, "Radau"), atol=1e-4, equal_nan=False)
     reference = fp.Trajectory(lambda t: {"slow": 0.5 + 0 * t, "fast": 1.0 + 0 * t})
     limits = fp.Limits(inputs={"u": (-2.0, 2.0)})
-    asked = {
-        "duration": 1.0,
-        "plant": STIFF,
-        "reference": reference,
-        "start": {"slow": 0.5, "fast": 0.9},
-        "limits": limits,
-        "period": 0.05,
-    }
+    asked = STIFF, reference, {"slow": 0.5, "fast": 0.9}, 0.05, 1.0
     with pytest.raises(fp.FpirhcError, match=r"use Reality\(..., integrator=Collocation\(\)\)"):
-        fp.Problem(**asked, reality=fp.Reality(STIFF))
-    fp.Problem(**asked, reality=fp.Reality(STIFF), integrator=fp.Collocation())
+        fp.Problem(*asked, limits=limits, reality=fp.Reality(STIFF))
+    fp.Problem(*asked, limits=limits, reality=fp.Reality(STIFF), integrator=fp.Collocation())
 
 
 # What a mismatch of P percent means, with a spread and without one
@@ -272,39 +212,66 @@ def fills(values: np.ndarray, low: float, high: float) -> bool:
 
 def test_the_option_scales_spreads_and_keeps_its_meaning_elsewhere():
     """50 %: half of an absolute width of 4, the square root of a factor at two deviations, and 50 % of what has no spread."""
-    zero = fp.Parameter(0.0, 0.0, "1")
-    parameters = {
-        "a": parameter(300.0, fp.Uniform(absolute=4.0)),
-        "k": parameter(-5.0, fp.LogNormal(factor=1.2)),
-        "zero": zero,
-    }
-    b, a, k, none = drawn(plant(**parameters), 50.0).T
+    wide, factor, zero = fp.Uniform(absolute=4.0), fp.LogNormal(factor=1.2), fp.Parameter(0.0, 0.0, "1")
+    b, a, k, none = drawn(plant(a=parameter(300.0, wide), k=parameter(-5.0, factor), zero=zero), 50.0).T
     assert fills(b, 0.5, 1.5)
     assert fills(a, 298.0, 302.0)
     assert fills(k, -5.0 * 1.2, -5.0 / 1.2)
     assert not none.any()
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: fp.Uniform(absolute=-1.0), "absolute: expected a finite number above 0, got -1.0"),
-        (lambda: fp.LogNormal(factor=0.9), "a number above 1"),
-        (
-            lambda: plant(z=parameter(0.0, fp.LogNormal(factor=2.0))),
-            "parameter 'z': spread: it has the value 0.*use Uniform or Normal",
-        ),
-        (lambda: plant(z=fp.Parameter(1.0, 1.0, "1", spread=0.3)), "expected a Spread or None, got 0.3"),  # type: ignore[arg-type]
-        # 100 % has no meaning for a parameter that could change its sign; with spreads everywhere it has.
-        (lambda: drawn(plant(a=parameter(2.0, fp.Uniform(absolute=0.1))), 100.0), "less than 100"),
-        (lambda: drawn(plant(), -1.0), "at least 0"),
-        # 0.5 -+ 0.3 leaves (0.35, 1): half of the spread stays inside.
-        (
-            lambda: drawn(plant(c=parameter(0.5, fp.Uniform(absolute=0.3), bounds=(0.35, 1.0))), 60.0),
-            r"parameter 'c'.*at most 50 % stay inside",
-        ),
-    ],
-)
-def test_wrong_spreads_are_refused(make, message):
-    with pytest.raises(fp.FpirhcError, match=message):
-        make()
+GOOD: dict[str, Any] = {
+    "coordinates": {"y": "m"},
+    "inputs": {"u": "N"},
+    "parameters": TWO,
+    "response": lambda q, v, u, p: {"y": u.u / p.m},
+}
+BAD: dict[str, dict[str, Any]] = {
+    "has no unit": {"parameters": {**TWO, "m": fp.Parameter(1.0, 1.0, "")}},
+    "Did you mean 'm'": {"response": lambda q, v, u, p: {"y": u.u / p.mm}},
+    "does not give the derivative y''": {"response": lambda q, v, u, p: {}},
+    "coordinate 'z' is unknown": {"response": lambda q, v, u, p: {"y": u.u, "z": u.u}},
+    "order must be a whole number": {"order": 0},
+    "order is 1000000000, and the highest possible is 20": {"order": 10**9},
+    "must be one scalar": {"response": lambda q, v, u, p: {"y": ca.vertcat(u.u, u.u)}},
+    "'y' names both an input and a coordinate; rename one": {"inputs": {"y": "N"}},
+}
+HARD: dict[str, Any] = {
+    "number 4": lambda: two_mass_chain(("a",)),
+    "controlled=": lambda: two_mass_chain().controlled_names,
+    r"3 inputs \(left, right, bow\).*by weights.*docs/plants.md": lambda: several(
+        {"left": "N", "right": "N", "bow": "N"},
+        lambda q, v, u, p: {"x": u.left + u.right + u.bow, "heading": u.right - u.left},
+    ),
+    "'v' has no independent effect there; .* control what follows from the rate of b": lambda: acting(
+        lambda x, _: 2 * x.a, 0.0
+    ),
+    "'v' has no independent effect there; start elsewhere": lambda: acting(lambda x, _: x.b**2, 0.0),
+    "2 mistakes.*approximate.*unit": lambda: fp.Plant(
+        {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(float("inf"), 1.0, "")}, lambda q, v, u, p: {"y": u.u}
+    ),
+    "expected a whole number from 1 to": lambda: fp.RungeKutta4(0),
+    # Spreads. 100 % has no meaning for a parameter that could change its sign; with spreads everywhere it has.
+    "absolute: expected a finite number above 0, got -1.0": lambda: fp.Uniform(absolute=-1.0),
+    "a number above 1": lambda: fp.LogNormal(factor=0.9),
+    "parameter 'z': spread: it has the value 0.*use Uniform or Normal": lambda: plant(
+        z=parameter(0.0, fp.LogNormal(factor=2.0))
+    ),
+    "expected a Spread or None, got 0.3": lambda: plant(z=parameter(1.0, 0.3)),
+    "less than 100": lambda: drawn(plant(a=parameter(2.0, fp.Uniform(absolute=0.1))), 100.0),
+    "at least 0": lambda: drawn(plant(), -1.0),
+    # 0.5 -+ 0.3 leaves (0.35, 1): half of the spread stays inside.
+    "parameter 'c'.*at most 50 % stay inside": lambda: drawn(
+        plant(c=parameter(0.5, fp.Uniform(absolute=0.3), bounds=(0.35, 1.0))), 60.0
+    ),
+}
+
+
+@pytest.mark.parametrize("message", [*BAD, *HARD])
+def test_mistakes_are_named(message):
+    if message in HARD:
+        with pytest.raises(fp.FpirhcError, match=rf"(?s){message}"):
+            HARD[message]()
+        return
+    with pytest.raises(fp.FpirhcError, match=r"(?s)" + message.replace("(", r"\(")):
+        fp.Plant(**{**GOOD, **BAD[message]})

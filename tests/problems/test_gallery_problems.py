@@ -1,12 +1,17 @@
-"""The gallery's plants are those of their sources, and its tasks show what their descriptions say.
+"""Plants of the gallery and of AdaptiveQuadBench are those of their sources, and tasks show what their descriptions say.
 
 References: Hodgkin and Huxley's equations as printed in 1952 (depolarisations negative, rest at zero); LuGre friction in
 steady sliding and at break-away as printed in 1995; the rated thrust of the P220; Drexler's equations in volumes instead of
-their logarithm; SciPy's stiff integrators.
+their logarithm; SciPy's stiff integrators; RotorPy.
 """
 
+import sys
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
+from pathlib import Path
+from runpy import run_path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -46,9 +51,6 @@ def rate_of(plant, command):
     return lambda t, x: plant.equations.rate(x, values(t), plant.exact).full().ravel()
 
 
-# Hahnfeldt's tumour
-
-
 def test_a_tumour_and_its_vessels_are_those_of_the_source():
     """Untreated from 180, 625 mm^3: 11157.5 and 14907.8 mm^3 after 20 days, 17346.5 mm^3 in the end; 14.58 mg/kg/day hold 100."""
     plant = task("tumour_vessels").problem.plant
@@ -67,9 +69,6 @@ def test_rounded_doses_are_whole_portions():
     for asked, given in ((12.4, 10.0), (12.6, 15.0), (1.0, 0.0)):
         rates = rate_of(problem.reality.plant, asked)(0, np.zeros(3))
         assert rates[2] == pytest.approx(given)
-
-
-# Hodgkin and Huxley
 
 
 def printed_in_1952(state, current):
@@ -102,17 +101,11 @@ def test_the_cell_has_no_singular_voltages(voltage, gate, rate):
     assert (rates[2] - rates[0]) / 2e-5 == pytest.approx(rate / 20, rel=1e-4)
 
 
-# Relative order four
-
-
 def test_four_lags_let_go():
     """From q = 1 at rest, without a force: q = exp(-t) (1 + t + t^2/2 + t^3/6)."""
     plant = task("order_four").problem.plant
     solution = solve_ivp(rate_of(plant, 0.0), (0, 5), [1.0, 0, 0, 0], rtol=1e-10, atol=1e-12).y[0, -1]
     assert solution == pytest.approx(np.exp(-5) * (1 + 5 + 25 / 2 + 125 / 6), rel=1e-7)
-
-
-# LuGre friction
 
 
 def test_sliding_friction_is_the_printed_curve():
@@ -142,9 +135,6 @@ def test_it_breaks_away_at_the_static_friction(force, slides):
         assert displacement == pytest.approx(-1.5e-4 * np.log(1 - force / 1.5), rel=0.02)
 
 
-# Tumour
-
-
 def test_the_logarithm_is_drexlers_model():
     """Volume and level of the drug by themselves, doses that change: the same volume, by SciPy."""
     a, b, c = 0.27, 0.0074, np.log(2) / 3.9
@@ -158,9 +148,6 @@ def test_the_logarithm_is_drexlers_model():
     plant = task("tumour").problem.plant
     solution = solve_ivp(rate_of(plant, dose), (0, 30), [np.log(2000.0), a], rtol=1e-10, atol=1e-12)
     assert solution.y[0, -1] == pytest.approx(np.log(volumes.y[0, -1]), rel=1e-8)
-
-
-# Turbojet
 
 
 @pytest.mark.parametrize(
@@ -181,9 +168,6 @@ def test_steady_thrust(throttle, small, large):
         assert solution.y[0, -1] == pytest.approx(root, rel=2e-3)
 
 
-# What the tasks show
-
-
 @pytest.mark.parametrize(
     "name", slow_but((*GALLERY, "anaesthesia", "anaesthesia_stimulated"), "anaesthesia", "turbojet", "tumour")
 )
@@ -192,9 +176,6 @@ def test_the_form_that_comes_first_is_as_good_as_the_published_one(name):
     assert isinstance(task(name).controllers[SAFE].deformation, fp.ModelReferenced)
     assert list(task(name).controllers).index(SAFE) < list(task(name).controllers).index("RHC+FPI")
     assert rms(name, SAFE) < 1.05 * rms(name, "RHC+FPI")
-
-
-# A ball on a plate
 
 
 def test_the_ball_rolls_as_lagrange_has_it():
@@ -218,9 +199,6 @@ def test_the_ball_rolls_as_lagrange_has_it():
         np.testing.assert_allclose([found["x'"], found["y'"]], expected, rtol=1e-12)
 
 
-# A house
-
-
 def test_an_economic_plan_of_a_day_is_that_of_ipopt():
     """Linear prices and a kink at the edge of the band: the same heat in every cycle of a day, to a hundredth of the largest."""
     problem = replace(task("building").problem, duration=24.0, measure_from=0.0)
@@ -229,3 +207,103 @@ def test_an_economic_plan_of_a_day_is_that_of_ipopt():
         for optimiser in (task("building").controllers["RHC"].optimiser, fp.Ipopt())
     ]
     np.testing.assert_allclose(heats[0], heats[1], atol=0.08)
+
+
+# The quadrotor of AdaptiveQuadBench: its equations, its trials and its rivals against what others computed and published
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "problems" / "outside" / "quadbench"
+
+
+@pytest.fixture(scope="module")
+def beside():
+    """The modules of the folder, and the benchmark's own."""
+    added = [str(FOLDER), str(ROOT / "benchmarks")]
+    sys.path[:0] = added
+    yield tuple(import_module(name) for name in ("draws", "quadbench", "vehicle"))
+    for one in added:
+        sys.path.remove(one)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Any:
+    return fp.load_problem(str(FOLDER / "quadbench.py"))
+
+
+def test_the_derivative_is_rotorpys(beside):
+    """To 1e-12 of its size, at random states, speeds and winds; its quaternion has the length one."""
+    pytest.importorskip("rotorpy", reason="RotorPy is not installed: pip install 'fpirhc[outside]'")
+    vehicle, told = beside[2], beside[2].BENCHMARK
+    parameters = {
+        **told,
+        **dict.fromkeys(("Ixy", "Ixz", "Iyz", "rotor_speed_min"), 0.0),
+        "num_rotors": 4,
+        "rotor_pos": {f"r{n}": place for n, place in enumerate(vehicle.rotors(told))},
+        "rotor_directions": np.array(vehicle.TURN),
+        "rotor_speed_max": vehicle.FASTEST,
+    }
+    multirotor = import_module("rotorpy.vehicles.multirotor")
+    theirs, rate = multirotor.Multirotor(parameters, aero=True), vehicle.derivative(told)
+    random = np.random.default_rng(0)
+    inertia = np.diag([told[name] for name in ("Ixx", "Iyy", "Izz")])
+    for _ in range(20):
+        q = random.normal(size=4)
+        state = np.concatenate(
+            [random.normal(size=6), q / np.linalg.norm(q), random.normal(size=3), random.uniform(0, 1000, 4)]
+        )
+        wind, speeds = random.normal(size=3), random.uniform(0, 1000, 4)
+        whole = theirs._s_dot_fn(0.0, np.concatenate([state[:13], wind, state[13:]]), speeds)
+        expected = np.delete(whole, [13, 14, 15])
+        own = np.asarray(rate(state, speeds, np.ones(4), wind, 0, 0, told["mass"], 0, inertia)).ravel()
+        assert np.all(np.abs(own - expected) <= 1e-12 * np.maximum(np.abs(expected), np.abs(expected).max() * 1e-3))
+
+
+def test_a_payload_moves_mass_centre_and_moment(beside):
+    """Hanging under one arm it turns the vehicle to that side, and falls as fast as the vehicle where no rotor turns."""
+    draws, _, vehicle = beside
+    numbers = {n: value for n, (value, _) in draws.NUMBERS.items()} | {"payload": 0.5, "offset_x": 0.2}
+    body = vehicle.Vehicle(numbers)
+    mass, centre, inertia, moment = body.loaded()
+    assert mass == pytest.approx(1.5 * 0.826)
+    assert centre == pytest.approx([0.2 * 0.166 / 3, 0.0, 0.0])
+    assert moment[1] > 0
+    assert moment[[0, 2]] == pytest.approx([0.0, 0.0])
+    body.reset(0)
+    arguments = (body.state, np.zeros(4), np.ones(4), np.zeros(3), np.zeros(3), np.zeros(3), mass, centre, inertia)
+    assert np.asarray(vehicle.RATE(*arguments)).ravel()[3:6] == pytest.approx([0.0, 0.0, -9.81])
+
+
+def test_the_trials_are_the_benchmarks(beside):
+    """The first goal of numpy's seed 42, and the same goals in every family; switches are half a second apart."""
+    draws = beside[0]
+    every = {family: draws.trials(family) for family in draws.FAMILIES}
+    first = np.random.RandomState(42).uniform(-2, 2, 9).reshape(3, 3)
+    assert np.array_equal(every["none"][1][0], first)
+    assert all(np.array_equal(goals, every["none"][1]) for _, goals in every.values())
+    for family in ("force", "torque", "payload"):
+        for told in every[family][0]:
+            times = [value for name, value in told.items() if name.startswith("switch_")]
+            assert 1 <= len(times) <= 4
+            assert times == sorted(times)
+            assert np.all(np.diff(times) >= 0.5)
+            assert 0.5 <= times[0] <= times[-1] <= 4.5
+    assert all(0 <= told["payload"] <= 0.5 for told in every["payload"][0])
+    assert {len(told) for told in every["none"][0]} == {0}
+
+
+# rms over 5 s, m, of the benchmark's own code in its first trials; motor noise is another one here.
+THEIRS = {"none 0": 0.04166036, "none 1": 0.02800689, "none 2": 0.02528741, "none 3": 0.03122853}
+THEIRS |= {"force 0": 0.04961751, "force 1": 0.0371662, "force 2": 0.12900266}
+
+
+@pytest.mark.parametrize("case", slow_but(THEIRS, "none 0", "force 2"))
+def test_incremental_inversion_here_is_the_benchmarks(bench, beside, case):
+    """Within 12 %: a tenth is what other motor noise does to it."""
+    del beside
+    table = run_path(str(ROOT / "benchmarks" / "quadbench.py"))
+    problem = bench.cases.problem(case, bench.problem)
+    told = {name: one.exact for name, one in problem.reality.parameters.items()}
+    errors = [
+        np.sqrt(np.mean(table["Rival"](told).distances(table["motion"](problem), problem.cycles, seed) ** 2))
+        for seed in (0, 1)
+    ]
+    assert np.mean(errors) == pytest.approx(THEIRS[case], rel=0.12)

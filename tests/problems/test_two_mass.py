@@ -31,18 +31,15 @@ def sigmoid(gain, scale=1.0):
     return fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=gain, shift=0.3, scale=scale))
 
 
-def test_without_adaptation_the_wrong_model_fails():
-    """Computed torque alone: 0.63 / 0.27 m."""
-    largest, _, response = late_error(tasks.two_mass.controllers["CTC"])
-    np.testing.assert_allclose(largest, [0.630, 0.271], rtol=0.01, equal_nan=False)
-    np.testing.assert_allclose(response, [39.0, 17.0], rtol=0.02, equal_nan=False)
-
-
-def test_equation_six_makes_it_precise():
-    """With A_c = -0.5: 6 / 3 mm, and the response error falls by a factor of a hundred."""
-    largest, _, response = late_error(tasks.two_mass.controllers["CTC+FPI (eq 6)"])
-    np.testing.assert_allclose(largest, [0.0061, 0.0033], rtol=0.08, equal_nan=False)
-    np.testing.assert_allclose(response, [0.35, 0.19], rtol=0.05, equal_nan=False)
+@pytest.mark.parametrize(
+    ("controller", "largest", "share", "response", "near"),
+    [("CTC", [0.630, 0.271], 0.01, [39.0, 17.0], 0.02), ("CTC+FPI (eq 6)", [0.0061, 0.0033], 0.08, [0.35, 0.19], 0.05)],
+)
+def test_the_wrong_model_fails_and_equation_six_makes_it_precise(controller, largest, share, response, near):
+    """With A_c = -0.5: 6 / 3 mm in place of 0.63 / 0.27 m, and the response error falls by a factor of a hundred."""
+    errors, _, of_responses = late_error(tasks.two_mass.controllers[controller])
+    np.testing.assert_allclose(errors, largest, rtol=share, equal_nan=False)
+    np.testing.assert_allclose(of_responses, response, rtol=near, equal_nan=False)
 
 
 def test_response_error_times_gain_over_period_is_constant():

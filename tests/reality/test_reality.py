@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import drives
 from helpers.drives import CONTROLLERS, FPI, PAIRS, PERIOD, SENSING, TAU, TRACK, lagged, parameters, run, task
+from helpers.of_outputs import curve, hill, sedated
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
@@ -96,9 +97,6 @@ def test_disturbance_of_a_state_that_the_model_does_not_have():
     assert problem.of_model.reality is None
 
 
-# What "exact" means
-
-
 def test_contraction_is_that_of_a_whole_cycle():
     """Behind the lag a request has done b / b^ (1 - exp(-T / tau)) to the response by the end of its cycle."""
     problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}))
@@ -114,8 +112,6 @@ def test_gain_of_the_wrong_sign_is_refused_behind_a_lag():
 
 
 # A reality with other states than the model needs only what is measured, controlled or judged; the rest is believed
-
-
 STEP, PARAMETERS = 0.05, {"b": fp.Parameter(approximate=1.0, exact=1.3, unit="1/l")}
 FILTER = fp.KalmanFilter(measured={"c1": 1e-4}, noise={"c1": 1.0, "c2": 0.01})
 BELIEVED = fp.Sensing(measured=["c1", "c1'"], observer=FILTER)
@@ -140,23 +136,6 @@ def compartments(deep: str = "c2") -> fp.Plant:
     )
 
 
-def three() -> fp.Plant:
-    """The same drug with two tissues, neither of them the model's."""
-    return fp.Plant(
-        coordinates={"c1": "mg/l", "fast": "mg/l", "slow": "mg/l"},
-        inputs={"u": "mg/min"},
-        order=1,
-        controlled=("c1",),
-        parameters=PARAMETERS,
-        response=lambda q, u, p: {
-            "c1": p.b * u.u - 0.7 * q.c1 + 0.4 * q.fast + 0.05 * q.slow,
-            "fast": 0.3 * q.c1 - 0.4 * q.fast,
-            "slow": 0.1 * q.c1 - 0.05 * q.slow,
-        },
-        time_unit="min",
-    )
-
-
 def infusion(**changes: Any) -> fp.Problem:
     """Blood along a sine; the tissue is nobody's to measure."""
     settings: dict[str, Any] = {
@@ -171,11 +150,6 @@ def infusion(**changes: Any) -> fp.Problem:
         "cost": fp.Quadratic(states={"c1": 10.0}, rate={"u": 1e-3}),
     }
     return fp.Problem(**(settings | changes))
-
-
-def other(**changes: Any) -> fp.Problem:
-    """The task with the three compartments as reality, settled."""
-    return infusion(reality=fp.Reality(three(), start={"fast": 1.5, "slow": 4.0}), **changes)
 
 
 @pytest.mark.parametrize(
@@ -195,112 +169,42 @@ def test_what_nobody_measures_may_have_any_name(controller):
 
 def test_no_cost_of_states_that_do_not_exist():
     """A plan has the believed tissue; a run is judged by its error, and its cost is left out."""
-    costs = [fp.measure(one, run(one, BLOOD))["cost"] for one in (other(duration=0.5), infusion(duration=0.5))]
+    other = infusion(duration=0.5, reality=fp.Reality(compartments("deep"), start={"deep": 3.0}))
+    costs = [fp.measure(one, run(one, BLOOD))["cost"] for one in (other, infusion(duration=0.5))]
     assert [bool(one) for one in costs] == [False, True]
 
 
-# A model with outputs: realities have these by name, and states of their own
-MINUTES = 1 / 12  # min
-FOLLOWED = fp.ComputedTorque(fp.Exponential(rate=1.5))
-OF_PATIENT = fp.Sigmoid(gain=-2.0, shift=0.3, scale=20.0)
-PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=3, tolerance=1e-1))
-BY_BIS = fp.KalmanFilter(measured={"bis": 1.0}, noise={"c": 0.01, "e": 0.01})
-SEEN = fp.Sensing(observer=BY_BIS)
-FIRST = {"C1": 2.0, "C2": 0.6, "C3": 0.1, "Ce": 1.5}
-START = 93.0 / (1 + (1.5 / 4.1) ** 1.36)
-RATES = (1.9 + 1.1 + 0.84, 1.1, 0.84, 4.27, 16.0, 238.0)  # clearances, l/min, and volumes, l
+# A model with outputs: a reality has these by name, and states of its own
+PATIENT = {"C1": 2.0, "C2": 0.6, "C3": 0.1, "site": 1.5}  # mg/l
 
 
-def depth(site: Any, p: Any, top: float) -> Any:
-    """Depth of anaesthesia by the concentration at the effect site."""
-    return top / (1 + (site / p.C50) ** p.steepness)
-
-
-def constants(half: float, steepness: float, speed: float) -> dict[str, fp.Parameter]:
-    return {
-        "C50": fp.Parameter(half, half, "mg/l"),
-        "steepness": fp.Parameter(steepness, steepness, "1"),
-        "ke0": fp.Parameter(speed, speed, "1/min"),
-    }
-
-
-def model(one: str = "c", site: str = "e") -> fp.Plant:
-    """One compartment and an effect site, under free names."""
-
-    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
-        return {one: -0.3 * x[one] + u.u / 8, site: p.ke0 * (x[one] - x[site])}
-
-    return fp.Plant.of_states(
-        states={one: "mg/l", site: "mg/l"},
-        inputs={"u": "mg/min"},
-        parameters=constants(4.5, 1.5, 0.3),
-        rates=rates,
-        outputs={"bis": fp.Output("1", lambda x, p: depth(x[site], p, 92.0))},
-        time_unit="min",
-    )
-
-
-def moved(x: Any, u: Any, ke0: Any) -> list[Any]:
-    """Rates of the patient, of numbers and of expressions: three compartments and an effect site."""
-    out, fast, slow, blood, muscle, fat = RATES
-    return [
-        (-out * x[0] + fast * x[1] + slow * x[2] + u) / blood,
-        fast / muscle * (x[0] - x[1]),
-        slow / fat * (x[0] - x[2]),
-        ke0 * (x[0] - x[3]),
-    ]
-
-
-def patient(unit: str = "1", output: str = "bis") -> fp.Plant:
-    """Three compartments and an effect site, with another curve."""
-    return fp.Plant.of_states(
-        states=dict.fromkeys(FIRST, "mg/l"),
-        inputs={"u": "mg/min"},
-        parameters=constants(4.1, 1.36, 0.2),
-        rates=lambda x, u, p: dict(zip(FIRST, moved([x[n] for n in FIRST], u.u, p.ke0), strict=True)),
-        outputs={output: fp.Output(unit, lambda x, p: depth(x.Ce, p, 93.0))},
-        time_unit="min",
-    )
-
-
-def lightly(t: Any) -> dict[str, Any]:
-    """From light sedation to 50, and to 45."""
-    return {"bis": 50 + (START - 50) * (1 + t / 1.5) * ca.exp(-t / 1.5) - 5 / (1 + ca.exp(-2 * (t - 12)))}
-
-
-def sedation(**changes: Any) -> fp.Problem:
-    """The patient, of whom the bis is measured, with the model of one compartment."""
-    settings: dict[str, Any] = {
-        "plant": model(),
-        "reference": fp.Trajectory(lightly),
-        "start": {"c": 1.5, "e": 1.5},
-        "period": MINUTES,
-        "duration": 20.0,
-        "reality": fp.Reality(patient(), start=FIRST),
-        "sensing": SEEN,
-        "limits": fp.Limits(inputs={"u": (0.0, 400.0)}),
-        "horizon": fp.Horizon(stages=10, step=3 * MINUTES),
-        "cost": fp.Quadratic(outputs={"bis": 1.0, "bis'": 0.1}, rate={"u": 1e-5}),
-    }
-    return fp.Problem(**(settings | changes))
-
-
-def sedated(problem: fp.Problem, controller: Any = FOLLOWED) -> fp.Run:
-    return fp.simulate(problem, controller, seed=0, compiled=False)
-
-
-# A reality
+def distributed(x: Any, u: Any) -> list[Any]:
+    """Rates of three compartments and an effect site, of numbers and of expressions."""
+    out, fast, slow = 0.9 * x[0], 0.26 * (x[0] - x[1]), 0.2 * (x[0] - x[2])
+    return [u - out - fast - slow, 4 * fast, slow / 60, 0.2 * (x[0] - x[3])]
 
 
 def test_it_moves_as_scipy_says():
-    """The commands, held over every cycle, move the patient's own equations alike; the bis is the patient's curve."""
-    result = sedated(sedation(duration=2.0), replace(FOLLOWED, deformation=OF_PATIENT))
-    x, states = np.array(list(FIRST.values())), []
+    """The commands, held over every cycle, move the patient's own equations alike; the depth is the patient's curve."""
+    patient = fp.Plant.of_states(
+        states=dict.fromkeys(PATIENT, "mg/l"),
+        inputs={"u": "mg/l/min"},
+        parameters={},
+        rates=lambda x, u, p: dict(zip(PATIENT, distributed([x[n] for n in PATIENT], u.u), strict=True)),
+        outputs={"depth": fp.Output("1", lambda x, p: curve(x.site, 4.1))},
+        time_unit="min",
+    )
+    believed = fp.Sensing(observer=fp.KalmanFilter(measured={"depth": 1.0}, noise={"C": 0.01, "E": 0.01}))
+    problem = sedated(hill(5.5), reality=fp.Reality(patient, start=PATIENT), sensing=believed)
+    law = fp.ComputedTorque(fp.Exponential(rate=1.5), fp.Sigmoid(gain=-2.0, shift=0.3, scale=20.0))
+    result = run(replace(problem, duration=2.0, measure_from=0.0), law)
+    x, states = np.array(list(PATIENT.values())), []
     for u in np.asarray(result["command"]).ravel():
         states.append(x)
-        x = solve_ivp(lambda t, x, u=u: moved(x, u, 0.2), (0, MINUTES), x, rtol=1e-11, atol=1e-13).y[:, -1]
+        x = solve_ivp(lambda t, x, u=u: distributed(x, u), (0, 1 / 60), x, rtol=1e-11, atol=1e-13).y[:, -1]
     np.testing.assert_allclose(result["reality_state"], states, rtol=2e-6)
-    np.testing.assert_allclose(result["output.bis"], 93 / (1 + (np.array(states)[:, 3] / 4.1) ** 1.36), rtol=2e-6)
+    np.testing.assert_allclose(result["output.depth"], curve(np.array(states)[:, 3], 4.1), rtol=2e-6)
+    assert np.ptp(result["command"]) > 0.1
 
 
 # A signal acts in every step of what moves with the value in its middle

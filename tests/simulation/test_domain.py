@@ -95,8 +95,6 @@ def test_what_was_learned_survives_a_sensor_below_the_bottom():
 
 
 # Loops
-
-
 ESTIMATED = (fp.PositionDifference(), fp.SavitzkyGolay(window=5, degree=1))
 
 
@@ -129,9 +127,6 @@ def test_a_plant_that_leaves_its_domain_still_ends_the_run():
     run = fp.simulate(start, fp.ComputedTorque(TRACK, SHAPE), seed=0, compiled=False)
     assert run.stop is not None
     assert "is not finite" in run.stop
-
-
-# Memories that have become absurd
 
 
 @pytest.mark.parametrize("name", ["Sigmoid", "Filtered", "Fractional", "plan"])

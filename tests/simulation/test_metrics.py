@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -152,6 +153,12 @@ def test_statuses_are_counted_and_the_worst_is_told():
     assert metrics.statuses == {"OK": 90, "NOT_CONVERGED": 7, "HELD": 3}
     assert metrics.worst_status == "HELD"
     assert repr(metrics["cycles"][""]) == "100"  # a count stays whole in files
+    # Two held cycles of that status, and the one in which the run ended; a status that never occurred counts zero.
+    status = np.where(np.arange(CYCLES) < 2, float(fp.Status.NON_FINITE), 0.0)
+    metrics = fp.measure(problem(), run(0.0, status=status, stop="signal 'x' is not finite"))
+    assert metrics.statuses == {"OK": 23, "NON_FINITE": 3}
+    always = ("OK", "NOT_CONVERGED", "INFEASIBLE", "HELD", "NON_FINITE")  # the others are statuses of a machine
+    assert metrics["status"] == {name: {"OK": 23, "NON_FINITE": 3}.get(name, 0) for name in always}
 
 
 def of_plans(metrics) -> dict[str, float]:
@@ -167,6 +174,8 @@ def test_solves_are_summed_up_over_the_whole_run():
     wanted = {"median_iterations": 5.5, "worst_iterations": 10, "median_stationarity": 5.5 / 9}
     assert of_plans(metrics) == pytest.approx({**wanted, "worst_stationarity": 10 / 9, "worst_feasibility": 10 / 81})
     assert metrics["plans"][""] == 10
+    assert of_solves(np.arange(CYCLES) // 10 % 2)["plans"][""] == 2  # plans that return are counted once
+    assert of_solves(np.arange(CYCLES))["plans"][""] == CYCLES
     said = {m.name: m.text(value) for m, _, value in metrics.rows()}
     assert [said[f"solve.{name}"] for name in ("worst_iterations", "median_stationarity")] == ["10", "0.6"]
     text = metrics.entries["solve.worst_iterations"].text
@@ -186,17 +195,26 @@ def test_a_run_that_ended_early_has_no_errors():
 
 
 def test_contraction_is_the_factor_of_the_plant_and_the_gain():
-    """With y'' = 1.6 u and a believed gain of one, J = 1.6: |1 - 1.6 a| for the effective gain a, from symbols and from the run."""
+    """With y'' = 1.6 u and a believed gain of one, J = 1.6: |1 - 1.6 a| for the effective gain a, from symbols and from the run.
+
+    The gain is that of the run; ten cycles are needed, and a controller that adapts nothing has no factor.
+    """
     deformation = fp.Sigmoid(gain=-0.4, scale=50.0)
     task = problem(plant=linear(1.6, 1.0), start={"y": 0.5}, period=1e-3, duration=1.0, measure_from=0.0)
     controllers = fp.ComputedTorque(fp.Exponential(rate=6.0), deformation), fp.ComputedTorque(fp.Exponential(rate=6.0))
-    adaptive, plain = (fp.measure(task, fp.simulate(task, c, seed=0, compiled=False)) for c in controllers)
-    factor = abs(1 - 1.6 * deformation.effective_gain())
+    result, plain = (fp.simulate(task, c, seed=0, compiled=False) for c in controllers)
+    factor, adaptive = abs(1 - 1.6 * deformation.effective_gain()), fp.measure(task, result)
     assert 0.1 < factor < 0.9
     assert adaptive["contraction.predicted"][""] == pytest.approx(factor)
     assert adaptive["contraction.measured"][""] == pytest.approx(factor, rel=0.1)
     assert adaptive["contraction.growing"][""] == 0.0
-    assert plain["contraction.predicted"] == {}
+    silent = replace(result, settings={k: v for k, v in result.settings.items() if k != "iterates"})
+    assert fp.measure(task, plain)["contraction.predicted"] == fp.measure(task, silent)["contraction.predicted"] == {}
+    larger = replace(result, settings={**result.settings, "effective_gain": 1.5})  # |1 - 1.6 * 1.5| = 1.4
+    assert fp.measure(task, larger)["contraction.growing"][""] == 1.0
+    for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.growing", "contraction.measured"})):
+        metrics = fp.measure(task, result.first(cycles))
+        assert {m.name for m, _, _ in metrics.rows() if m.name.startswith("contraction")} == names
 
 
 def test_contraction_with_a_signal_from_outside_is_that_of_the_middle_of_a_cycle():
@@ -256,53 +274,12 @@ def test_a_run_that_ended_at_once_has_no_numbers():
     assert metrics.broken == fp.measure(problem(), run(1.0)).broken == {}
 
 
-def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
-    """Two held cycles of that status, and the one in which the run ended; a status that never occurred counts zero."""
-    status = np.where(np.arange(CYCLES) < 2, float(fp.Status.NON_FINITE), 0.0)
-    metrics = fp.measure(problem(), run(0.0, status=status, stop="signal 'x' is not finite"))
-    assert metrics.statuses == {"OK": 23, "NON_FINITE": 3}
-    always = ("OK", "NOT_CONVERGED", "INFEASIBLE", "HELD", "NON_FINITE")  # the others are statuses of a machine
-    assert metrics["status"] == {name: {"OK": 23, "NON_FINITE": 3}.get(name, 0) for name in always}
-
-
-def test_plans_that_return_are_counted_once():
-    assert of_solves(np.arange(CYCLES) // 10 % 2)["plans"][""] == 2
-    assert of_solves(np.arange(CYCLES))["plans"][""] == CYCLES
-
-
 def test_a_plan_that_is_not_finite_has_iterations_and_no_residual():
     """It took its time, and its residual is no number of a plan."""
     solve = np.tile([0.0, 0.1, 0.2, 3.0, fp.Status.OK], (CYCLES, 1))
     solve[7] = [0.0, 9.0, 9.0, 50.0, fp.Status.NON_FINITE]
     of = of_plans(fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))))
     assert (of["worst_iterations"], of["worst_stationarity"], of["worst_feasibility"]) == (50, 0.1, 0.2)
-
-
-@pytest.fixture(scope="module")
-def adaptive():
-    """A run of computed torque with adaptation and its problem, a thousand cycles."""
-    task = problem(plant=linear(1.6, 1.0), start={"y": 0.5}, period=1e-3, duration=1.0, measure_from=0.0)
-    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.4, scale=50.0))
-    return task, fp.simulate(task, controller, seed=0, compiled=False)
-
-
-def test_contraction_needs_ten_cycles(adaptive):
-    task, result = adaptive
-    for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.growing", "contraction.measured"})):
-        metrics = fp.measure(task, result.first(cycles))
-        assert {m.name for m, _, _ in metrics.rows() if m.name.startswith("contraction")} == names
-
-
-def test_contraction_is_that_of_an_adapting_controller(adaptive):
-    """A controller that adapts nothing has no factor, and the gain is that of the run."""
-    task, result = adaptive
-    silent = replace(result, settings={k: v for k, v in result.settings.items() if k != "iterates"})
-    larger = replace(result, settings={**result.settings, "effective_gain": 1.5})  # |1 - 1.6 * 1.5| = 1.4
-    assert fp.measure(task, larger)["contraction.growing"][""] == 1.0
-    assert fp.measure(task, silent)["contraction.predicted"] == {}
-
-
-# --- A metric of a user's own -----------------------------------------------------------------------------------------
 
 
 def overshoot(task, run):
@@ -323,19 +300,23 @@ def test_a_metric_is_one_value():
         metrics["overshot"]
 
 
-@pytest.mark.parametrize(
-    ("by", "result", "message"),
-    [
-        ("coordinate", 3.0, "must return a mapping with a number for every coordinate, got float"),
-        (None, {"y": 3.0}, "must return one number, got dict"),
-        ("coordinate", {"y": "three"}, "expected numbers, got str"),
-    ],
-)
-def test_a_function_that_returns_something_else_is_refused(by, result, message):
-    """By coordinate means a mapping of numbers."""
-    metric = fp.Metric("mine", lambda problem, run: result, by=by)
-    with pytest.raises(InvalidValue, match=f"metric 'mine': .*{message}"):
-        fp.measure(problem(), run(0.0), [metric])
+def returning(by: Any, result: Any) -> fp.Metric:
+    return fp.Metric("mine", lambda problem, run: result, by=by)
+
+
+REFUSED: dict[str, Callable[[], Any]] = {
+    "metric 'mine': .*must return a mapping with a number for every coordinate, got float": lambda: returning("coordinate", 3.0),
+    "metric 'mine': .*must return one number, got dict": lambda: returning(None, {"y": 3.0}),
+    "metric 'mine': .*expected numbers, got str": lambda: returning("coordinate", {"y": "three"}),
+    "low is 3 and high is 2; expected low < high": lambda: fp.figures.InBand("command.u", 3.0, 2.0),
+    "low is 3 and high is 3; expected low < high": lambda: fp.figures.InBand("command.u", 3.0, 3.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_a_metric_that_has_no_meaning_is_refused(message):
+    with pytest.raises(InvalidValue, match=message):
+        fp.measure(problem(), run(0.0), [REFUSED[message]()])
 
 
 TAKEN = {
@@ -356,8 +337,6 @@ def test_a_name_that_stands_for_something_else_in_results_is_refused(name, tmp_p
 
 
 # Figures of merit by value, on runs that were made by hand; 50 cycles of 0.1 s are measured, from t = 5 s on
-
-
 figures = fp.figures
 # Ten before the measured part, which does not count; then 3 and -4 in turn.
 COMMAND = np.where(np.arange(CYCLES) < 50, 10.0, np.where(np.arange(CYCLES) % 2, 3.0, -4.0))
@@ -402,12 +381,6 @@ def test_the_first_direction_is_that_from_the_start_to_the_reference():
     """A set point that never moves: the plant begins 1 m below it and goes 0.3 m beyond."""
     metrics = fp.measure(problem(), run(step(1.0, -0.3, 1), reference=np.zeros(CYCLES)), [figures.Overshoot("y")])
     assert metrics["overshoot"][""] == pytest.approx(0.3)
-
-
-@pytest.mark.parametrize("high", [2.0, 3.0])
-def test_a_band_without_a_width_is_refused(high):
-    with pytest.raises(InvalidValue, match=f"low is 3 and high is {high:g}; expected low < high"):
-        figures.InBand("command.u", 3.0, high)
 
 
 def test_a_signal_that_is_not_there_breaks_its_figure_alone():

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -21,66 +21,53 @@ REFERENCED = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.ModelReferenced(fp.A
 CYCLES = 40
 
 
-def shipped(name: str, controller: str) -> Callable[[], Loop]:
+def shipped(name: str, controller: str) -> Loop:
     """A shipped problem and one of its controllers."""
-
-    def make() -> Loop:
-        task = fp.load_problem(name)
-        return task.problem, task.controllers[controller]
-
-    return make
+    task = fp.load_problem(name)
+    return task.problem, task.controllers[controller]
 
 
-def in_every_cycle(name: str, controller: str, growth: float = 1.0) -> Callable[[], Loop]:
+def in_every_cycle(name: str, controller: str, growth: float = 1.0) -> Loop:
     """A shipped problem whose stages last longer than a cycle, with a plan in every cycle."""
-
-    def make() -> Loop:
-        problem, chosen = shipped(name, controller)()
-        assert problem.horizon is not None
-        assert problem.horizon.step > 1.5 * problem.period
-        lengths = tuple(growth**k for k in range(problem.horizon.stages)) if growth > 1 else ()
-        return replace(problem, horizon=replace(problem.horizon, replan="cycle", lengths=lengths)), chosen
-
-    return make
+    problem, chosen = shipped(name, controller)
+    assert problem.horizon is not None
+    assert problem.horizon.step > 1.5 * problem.period
+    lengths = tuple(growth**k for k in range(problem.horizon.stages)) if growth > 1 else ()
+    return replace(problem, horizon=replace(problem.horizon, replan="cycle", lengths=lengths)), chosen
 
 
-def sensed(estimator: Any, lost: float = 0.0) -> Callable[[], Loop]:
+def sensed(estimator: Any, lost: float = 0.0) -> Loop:
     """Two masses seen late by coarse encoders with noise, which may lose samples, through an estimator."""
-
-    def make() -> Loop:
-        problem = fp.load_problem("two_mass").problem
-        sensor = fp.Sensor(noise=fp.Noise(1e-5, 1e-2), quantum=1e-5, dropout=lost)
-        late = fp.DeadTime(inputs={"Q1": 0.002, "Q2": 0.001}, measurement=0.0015)
-        return replace(problem, sensing=fp.Sensing({"q1": sensor, "q2": sensor}, estimator), dead_time=late), REFERENCED
-
-    return make
+    problem = fp.load_problem("two_mass").problem
+    sensor = fp.Sensor(noise=fp.Noise(1e-5, 1e-2), quantum=1e-5, dropout=lost)
+    late = fp.DeadTime(inputs={"Q1": 0.002, "Q2": 0.001}, measurement=0.0015)
+    return replace(problem, sensing=fp.Sensing({"q1": sensor, "q2": sensor}, estimator), dead_time=late), REFERENCED
 
 
-def on_form(name: str) -> Callable[[], Loop]:
+def on_form(name: str) -> Loop:
     """A form of the problem of one moved thing, with adaptation where its output has an order."""
     problem, order = FORMS[name]
-    static = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.3), lag=0.0)
-    return lambda: (problem, FPI if order else static)
+    return problem, FPI if order else fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.3), lag=0.0)
 
 
 LOOPS: dict[str, Callable[[], Loop]] = {
-    "outputs, outside signals": shipped("anaesthesia_stimulated", "RHC+FPI"),
-    "map": shipped("fishery", "RHC+FPI"),
-    "order zero, reality": shipped("freeway", "static map+FPI"),
-    "map with signals": shipped("freeway_metering", "CTC+FPI"),
-    "cascade": shipped("heat_exchanger", "Cascade"),
-    "noise": shipped("noisy_motor", "RHC+FPI"),
-    "plans between stages": in_every_cycle("noisy_motor", "RHC+FPI"),
-    "growing stages": in_every_cycle("two_mass", "RHC+FPI", growth=1.1),
-    "predicted plans between stages": in_every_cycle("delayed_mass", "RHC+FPI"),
-    "prediction": shipped("delayed_mass", "RHC+FPI"),
-    "slots": shipped("cart_pole_slots", "slots+FPI"),
-    "learning": shipped("turbojet", "RHC offset-free"),
-    "lost": sensed(fp.PositionDifference(), lost=0.1),
+    "outputs, outside signals": partial(shipped, "anaesthesia_stimulated", "RHC+FPI"),
+    "map": partial(shipped, "fishery", "RHC+FPI"),
+    "order zero, reality": partial(shipped, "freeway", "static map+FPI"),
+    "map with signals": partial(shipped, "freeway_metering", "CTC+FPI"),
+    "cascade": partial(shipped, "heat_exchanger", "Cascade"),
+    "noise": partial(shipped, "noisy_motor", "RHC+FPI"),
+    "plans between stages": partial(in_every_cycle, "noisy_motor", "RHC+FPI"),
+    "growing stages": partial(in_every_cycle, "two_mass", "RHC+FPI", growth=1.1),
+    "predicted plans between stages": partial(in_every_cycle, "delayed_mass", "RHC+FPI"),
+    "prediction": partial(shipped, "delayed_mass", "RHC+FPI"),
+    "slots": partial(shipped, "cart_pole_slots", "slots+FPI"),
+    "learning": partial(shipped, "turbojet", "RHC offset-free"),
+    "lost": partial(sensed, fp.PositionDifference(), lost=0.1),
 }
 INTERPRETED = {
-    **{name: on_form(name) for name in FORMS},
-    **{str(e): sensed(e) for e in examples("derivative estimators")},
+    **{name: partial(on_form, name) for name in FORMS},
+    **{str(e): partial(sensed, e) for e in examples("derivative estimators")},
 }
 
 
@@ -202,9 +189,8 @@ CASES = {
 def case(name: str) -> tuple[fp.Stepper, np.ndarray]:
     """A stepper, and rows of what it reads: a run's samples, with faults in some of them."""
     of, controller, live = CASES[name]
-    task = fp.load_problem(of)
-    stepper = fp.Stepper(task.problem, task.controllers[controller], live=live, compiled=False, bridged=0)
-    run = fp.simulate(task.problem, task.controllers[controller], seed=0, compiled=False)
+    stepper = fp.Stepper(*shipped(of, controller), live=live, compiled=False, bridged=0)
+    run = fp.simulate(*shipped(of, controller), seed=0, compiled=False)
     rows = np.tile(stepper.reads.start(), (CYCLES, 1))
     for signal in stepper.reads.signals:
         if signal.name in ("time", "state", "output", "realised", "measured"):
@@ -243,15 +229,10 @@ def test_a_loop_of_ones_own_is_the_stepper_bit_by_bit(name):
         assert all(same_bits(trace[places[n] - v.size : places[n]], v) for n, v in shown.items()), k
 
 
-def _of(name: str):
-    task = fp.load_problem(CASES[name][0])
-    return task.problem, task.controllers[CASES[name][1]]
-
-
 def test_bounds_are_where_the_check_begins_to_refuse():
     """Every number inside is accepted, and one a little beyond an end is refused; limits of inputs end at those of the build."""
     live = ["deformation.gain", "tracking.rate", "limits.inputs.Q1.0", "limits.inputs.Q1.1"]
-    stepper = fp.Stepper(*_of("CTC+FPI"), live=live, compiled=False)
+    stepper = fp.Stepper(*shipped("two_mass", "CTC+FPI (eq 6)"), live=live, compiled=False)
     bounds, build = stepper.bounds(), dict(stepper.numbers)
     assert list(bounds) == live
     for path in ("deformation.gain", "tracking.rate"):

@@ -1,5 +1,6 @@
 """Signals from outside: known and previewed, unknown; a room that is heated against the weather."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -181,22 +182,18 @@ def priced(cost: Any) -> fp.Problem:
 
 def test_a_cost_sees_signals_from_outside():
     """`view.outside.price` is that of the stage: heat is bought before it rises, and little while it is high."""
+    prices: dict[str, Callable[[Any], Any]] = {"seen": lambda view: view.outside.price, "flat": lambda view: 0.2}
+    controller, bought = fp.RecedingHorizon(fp.FixedPointSolver(iterations=20, tolerance=1e-3)), {}
+    for name, price in prices.items():
 
-    def economic(view):
-        return {"comfort": (view.state.air - 293.0) ** 2, "heat": 0.05 * view.outside.price * view.input.heat**2}
+        def terms(view, price=price):
+            return {"comfort": (view.state.air - 293.0) ** 2, "heat": 0.05 * price(view) * view.input.heat**2}
 
-    def flat(view):
-        return {"comfort": (view.state.air - 293.0) ** 2, "heat": 0.05 * 0.2 * view.input.heat**2}
-
-    controller = fp.RecedingHorizon(fp.FixedPointSolver(iterations=20, tolerance=1e-3))
-    bought = {}
-    for terms in (economic, flat):
-        problem = priced(fp.CustomCost(terms))
-        run = fp.simulate(problem, controller, seed=0, compiled=False)
-        time, heat = run["time"].ravel(), run["command.heat"].ravel()
-        bought[terms.__name__] = [heat[(time >= a) & (time < b)].mean() for a, b in ((7.0, 10.0), (10.0, 14.0))]
-    assert bought["economic"][0] > 1.05 * bought["flat"][0]
-    assert bought["economic"][1] < 0.9 * bought["flat"][1]
+        logged = run(priced(fp.CustomCost(terms)), controller)
+        time, heat = logged["time"].ravel(), logged["command.heat"].ravel()
+        bought[name] = [heat[(time >= a) & (time < b)].mean() for a, b in ((7.0, 10.0), (10.0, 14.0))]
+    assert bought["seen"][0] > 1.05 * bought["flat"][0]
+    assert bought["seen"][1] < 0.9 * bought["flat"][1]
 
 
 BAD = {

@@ -1,5 +1,6 @@
 """References: set-points whose filter is exact, disturbances, the input before the first cycle, and other exact parameters."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -7,11 +8,11 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.plants import chain
+from helpers.plants import chain, heavy, simulated
 
 import fpirhc as fp
 from fpirhc.contracts import Disturbance
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue
+from fpirhc.errors import InvalidName
 
 STEPS = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": [(0.0, 5.4), (0.1, 5.6), (0.2, 5.3)]}
 
@@ -77,7 +78,7 @@ def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(na
     ours = on(problem, fp.Setpoint(steps, rate=rate, order=order), 0.2)
     theirs = on(problem, closed_form(rate, order, starts, steps), 0.2)
     for controller in (one for one in task.controllers.values() if one.planner is None):
-        runs = [fp.simulate(p, controller, seed=0, compiled=False) for p in (ours, theirs)]
+        runs = [simulated(p, controller) for p in (ours, theirs)]
         assert runs[0].cycles == runs[1].cycles > 0
         states = [run["plant_state"] for run in runs]
         assert np.ptp(states[1], axis=0).max() > 1e-3, controller  # it does move
@@ -92,9 +93,7 @@ def test_a_horizon_knows_no_set_point_ahead():
     """A step moves nothing before its time, and the command in its first cycle."""
     controller, starts = tasks.two_mass.controllers["RHC+FPI"], {"q1": 2.2, "q2": 5.4}
     steps = {"q1": [(0.0, 2.2), (0.25, 2.4)], "q2": [(0.0, 5.4), (0.25, 5.2)]}
-    surprise, still = (
-        fp.simulate(two_mass(values=values), controller, seed=0, compiled=False) for values in (steps, starts)
-    )
+    surprise, still = (simulated(two_mass(values=values), controller) for values in (steps, starts))
     np.testing.assert_array_equal(surprise["command"][:250], still["command"][:250])
     assert np.abs(surprise["command"][250] - still["command"][250]).max() > 0.1
 
@@ -118,7 +117,7 @@ def test_changed_equals_rebuilt_without_another_build(controller, compiled):
 def test_stepper_agrees_with_the_loop():
     """Stepped with what the loop saw, and with the set-points when they change, the stepper gives the loop's commands."""
     problem, controller = two_mass(), tasks.two_mass.controllers["CTC+FPI (eq 6)"]
-    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    run = simulated(problem, controller)
     stepper = fp.Stepper(problem, controller, compiled=False)
     memory = stepper.start()
     for k in range(run.cycles):
@@ -149,25 +148,6 @@ def test_a_step_without_set_points_keeps_the_old_ones():
         stepper.step(*sample, setpoints={"q3": 1.0})
 
 
-def test_bad_references():
-    """A wrong set-point is a mistake of the problem: missing, unknown, out of range, or with too low a filter."""
-    for changes, words in (
-        ({"values": {"q1": 1.0}}, "'q2' has no nominal motion"),
-        ({"values": {"q1": 1.0, "q2": 2.0, "q4": 1.0}}, "'q4' is unknown"),
-        ({"order": 1}, "below the order 2"),
-    ):
-        with pytest.raises(InvalidProblem, match=words):
-            two_mass(**changes)
-    limited = replace(tasks.two_mass.problem.limits, states={"q1": (2.0, 2.3)})
-    with pytest.raises(InvalidProblem, match=r"'q1' is 2\.4, outside its limits of 2 to 2\.3"):
-        replace(two_mass(), limits=limited)
-    replace(two_mass(), limits=replace(limited, prices={"q1": 1.0}))  # a limit with a price may be passed
-    with pytest.raises(InvalidName, match="a Trajectory, has no set-points"):
-        fp.simulate(
-            tasks.two_mass.problem, tasks.two_mass.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": 1.0}
-        )
-
-
 def test_run_and_file_record_what_was_in_force(tmp_path):
     """Signal 'setpoint' has it cycle by cycle, the facts have it as steps; the terminal shows it."""
     run = fp.simulate(
@@ -189,7 +169,7 @@ def test_a_slot_has_the_filter_of_its_chain():
     reference = fp.Setpoint(
         {n: [(0.0, 5.0), (task.problem.period, w)] for n, w in (("h1", 2.5), ("h2", 3.6))}, rate=rate
     )
-    run = fp.simulate(on(task.problem, reference, 1.0), task.controllers["slots"], seed=0, compiled=False)
+    run = simulated(on(task.problem, reference, 1.0), task.controllers["slots"])
     assert [run[f"nominal.{name}"][1] for name in ("h2", "h1")] == pytest.approx([rate**2 * -1.4, rate * -2.5])
 
 
@@ -203,7 +183,7 @@ def test_predicted_says_that_set_points_are_late():
     assert any("follows set-points 0.06 s late" in note for note in notes)
     assert not any("late" in note for note in controller.notes(task.problem))
     exact = fp.ExactModel(controller)
-    run = fp.simulate(problem, exact, seed=0, compiled=False)
+    run = simulated(problem, exact)
     late = round(0.06 / problem.period)
     lag = run[f"plant_state.{name}"][late:] - run[f"reference.{name}"][:-late]
     assert np.abs(lag).max() < 0.2 * np.abs(run[f"true_error.{name}"]).max()
@@ -217,14 +197,7 @@ def test_derivatives_up_to_the_order():
     np.testing.assert_allclose(result, expected, rtol=1e-12, equal_nan=False)
 
 
-def test_missing_and_unknown_coordinates():
-    with pytest.raises(InvalidProblem, match=r"(?s)'z' is unknown.*'y' has no nominal motion"):
-        fp.Trajectory(lambda t: {"z": t}).function(chain(2))
-
-
 # Disturbances: what they are at which time
-
-
 TIMES = np.linspace(0, 2, 21)
 
 
@@ -232,21 +205,13 @@ def _values(disturbance, seed=0):
     return disturbance.values(TIMES, np.random.default_rng(seed))
 
 
-def test_step_and_pulse():
-    """Edges are where they were asked for."""
+def test_disturbances_have_their_values():
+    """Edges are where they were asked for, noise is drawn from the seed, and a formula is its own."""
     assert _values(fp.Step(at=1.0, size=3.0)).tolist() == [0.0] * 10 + [3.0] * 11
     assert _values(fp.Step(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
-
-
-def test_noise_is_drawn_from_the_seed():
     assert np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 4))
     assert not np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 5))
-
-
-def test_formula_must_be_finite():
     np.testing.assert_allclose(_values(fp.Formula(lambda t: ca.exp(-t))), np.exp(-TIMES), equal_nan=False)
-    with pytest.raises(InvalidValue, match="not finite at t = 0"):
-        _values(fp.Formula(lambda t: 1 / t))
 
 
 def test_a_disturbance_of_a_users_own_acts_with_its_values():
@@ -259,22 +224,16 @@ def test_a_disturbance_of_a_users_own_acts_with_its_values():
     reference = fp.Trajectory(lambda t: {"y": 0 * t})
     problem = fp.Problem(chain(2), reference, {"y": 0.0}, 0.1, 2.0, disturbances={"y": Sawtooth()})
     still = fp.ComputedTorque(fp.Exponential(rate=1e-9, integral=False))
-    speed = fp.simulate(problem, still, seed=0, compiled=False)["state.y'"]
+    speed = simulated(problem, still)["state.y'"]
     acting = 3.0 * np.mod(0.1 * np.arange(20) + 1e-12, 0.5)
     np.testing.assert_allclose(speed, 0.1 * np.concatenate([[0.0], np.cumsum(acting)[:-1]]), atol=1e-7)
 
 
 # The input before the first cycle
 MASS, PERIOD = 2.0, 1e-2
-PLANT = fp.Plant(
-    coordinates={"y": "m"},
-    inputs={"u": "N"},
-    parameters={"m": fp.Parameter(MASS, MASS, "kg")},
-    response=lambda q, v, u, p: {"y": u.u / p.m},
-)
 COST = fp.Quadratic(states={"y": 1.0}, effort={"u": 1e-3})
 PROBLEM = fp.Problem(
-    plant=PLANT,
+    plant=heavy(MASS, MASS, q="y"),
     reference=fp.Trajectory(lambda t: {"y": 1.0 + 0.0 * ca.sin(t)}),
     start={"y": 1.0},
     period=PERIOD,
@@ -282,13 +241,6 @@ PROBLEM = fp.Problem(
     horizon=fp.Horizon(stages=5, step=PERIOD),
     cost=COST,
 )
-COMPUTED = fp.ComputedTorque(fp.Exponential(rate=6.0))
-
-
-def planned(problem: fp.Problem, optimiser: fp.Ipopt | fp.FixedPointSolver) -> float:
-    """The first planned input."""
-    run = fp.simulate(replace(problem, duration=PERIOD), fp.RecedingHorizon(optimiser), seed=0, compiled=False)
-    return float(run["command.u"][0])
 
 
 def test_it_is_zero_or_the_nearest_limit_unless_it_is_given():
@@ -302,33 +254,20 @@ def test_it_is_zero_or_the_nearest_limit_unless_it_is_given():
         assert problem.inputs_before.tolist() == [expected]
 
 
-@pytest.mark.parametrize(
-    ("before", "message"),
-    [
-        ({"w": 1.0}, "input_before: input 'w' is unknown"),
-        ({"u": 99.0}, "'u' must be a finite number within its limits, got 99.0"),
-        ({"u": float("inf")}, "finite"),
-    ],
-)
-def test_mistakes_are_named(before, message):
-    with pytest.raises(InvalidProblem, match=message):
-        replace(PROBLEM, limits=fp.Limits(inputs={"u": (-10.0, 10.0)}), input_before=before)
-
-
 def test_the_first_weight_of_a_rate_is_counted_from_it():
     """With a rate weight that outweighs everything else the first input stays where the input was."""
-    cost = replace(COST, rate={"u": 1e9})
+    short = replace(PROBLEM, cost=replace(COST, rate={"u": 1e9}), duration=PERIOD)
     for before in (0.0, 3.0, -7.0):
-        problem = replace(PROBLEM, cost=cost, input_before={"u": before})
         for optimiser in (fp.Ipopt(), fp.FixedPointSolver(iterations=3, tolerance=1e-3)):
-            assert planned(problem, optimiser) == pytest.approx(before, abs=1e-4)
+            run = simulated(replace(short, input_before={"u": before}), fp.RecedingHorizon(optimiser))
+            assert run["command.u"][0] == pytest.approx(before, abs=1e-4)
 
 
 def test_it_acts_until_the_first_command_arrives():
     """A mass under a constant force: y = 1 + u t^2 / (2 m) for as long as no command has arrived, by hand."""
     waiting = 0.1
     late = replace(PROBLEM, dead_time=fp.DeadTime(inputs={"u": waiting}), input_before={"u": 3.0})
-    run = fp.simulate(late, COMPUTED, seed=0, compiled=False)
+    run = simulated(late, fp.ComputedTorque(fp.Exponential(rate=6.0)))
     times = run.time[run.time <= waiting + PERIOD / 2]
     np.testing.assert_allclose(run["plant_state.y"][: times.size], 1 + 3.0 * times**2 / (2 * MASS), rtol=1e-12)
 
@@ -342,14 +281,45 @@ def test_a_run_of_what_is_shared_is_that_of_the_problem_that_is_built_anew(name)
     task = fp.load_problem(name)
     problem = replace(task.problem.of_model, duration=15 * task.problem.period, measure_from=0.0)
     plain, known = task.controllers[LOOPS[name]], fp.ExactModel(task.controllers[LOOPS[name]])
-    first = fp.simulate(problem, plain, seed=0, compiled=False)
+    first = simulated(problem, plain)
     exact = problem.plant.exact * 1.05
     values = zip(problem.plant.parameters.items(), exact, strict=True)
     anew = replace(
         problem, plant=replace(problem.plant, parameters={n: replace(p, exact=float(v)) for (n, p), v in values})
     )
     for controller in (plain, known):
-        one, other = (fp.simulate(p, controller, seed=0, compiled=False) for p in (problem.with_exact(exact), anew))
+        one, other = (simulated(p, controller) for p in (problem.with_exact(exact), anew))
         np.testing.assert_array_equal(one.log, other.log)
         assert not np.array_equal(one["plant_state"], first["plant_state"])
-    np.testing.assert_array_equal(fp.simulate(problem, plain, seed=0, compiled=False).log, first.log)
+    np.testing.assert_array_equal(simulated(problem, plain).log, first.log)
+
+
+# Refusals
+LIMITED = replace(tasks.two_mass.problem.limits, states={"q1": (2.0, 2.3)})
+
+
+def begun(before: dict[str, float]) -> fp.Problem:
+    return replace(PROBLEM, limits=fp.Limits(inputs={"u": (-10.0, 10.0)}), input_before=before)
+
+
+REFUSED: dict[str, Callable[[], Any]] = {
+    r"(?s)'z' is unknown.*'y' has no nominal motion": lambda: fp.Trajectory(lambda t: {"z": t}).function(chain(2)),
+    "'q2' has no nominal motion": lambda: two_mass(values={"q1": 1.0}),
+    "'q4' is unknown": lambda: two_mass(values={"q1": 1.0, "q2": 2.0, "q4": 1.0}),
+    "below the order 2": lambda: two_mass(order=1),
+    r"'q1' is 2\.4, outside its limits of 2 to 2\.3": lambda: replace(two_mass(), limits=LIMITED),
+    "a Trajectory, has no set-points": lambda: fp.simulate(
+        tasks.two_mass.problem, tasks.two_mass.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": 1.0}
+    ),
+    "not finite at t = 0": lambda: _values(fp.Formula(lambda t: 1 / t)),
+    "input_before: input 'w' is unknown": lambda: begun({"w": 1.0}),
+    r"'u' must be a finite number within its limits, got 99\.0": lambda: begun({"u": 99.0}),
+    "finite number within its limits, got inf": lambda: begun({"u": float("inf")}),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_a_mistake_is_named(words):
+    replace(two_mass(), limits=replace(LIMITED, prices={"q1": 1.0}))  # a limit with a price may be passed
+    with pytest.raises(fp.FpirhcError, match=words):
+        REFUSED[words]()
