@@ -1,16 +1,91 @@
 """A probe of bodies whose gain, dead time, lag and noise are known."""
 
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
-from helpers.bodies import PERIOD, RHC, Body, body_problem
 
 import fpirhc as fp
 from fpirhc.contracts import Deformation
+
+PERIOD = 1e-2
+
+RHC = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-2))
+
+
+@dataclass
+class Body:
+    """A body with a gain matrix, a dead time in cycles, a lag in s, and a noise of the measured response.
+
+    q'' = Lambda lag(u(t - d T)) - .5 v - 2 sin(q) + sin(1.3 t + k); the model is q'' = u.
+    """
+
+    gains: np.ndarray
+    dead: int = 0
+    lag: float = 0.0
+    noise: float = 0.0
+
+    def reset(self, seed: int) -> np.ndarray:
+        n = len(self.gains)
+        self.random, self.queue = np.random.default_rng(seed), [np.zeros(n)] * self.dead
+        self.moving, self.now = cycle(tuple(map(tuple, self.gains)), self.lag), np.zeros(3 * n)
+        return np.zeros(3 * n)
+
+    def step(self, time: float, command: np.ndarray) -> np.ndarray:
+        self.queue.append(command)
+        moved, response = (one.full().ravel() for one in self.moving(time, self.now, self.queue.pop(0)))
+        self.now = moved
+        noise = self.noise * self.random.standard_normal(len(response))
+        return np.concatenate([moved[: 2 * len(response)], response + noise])
+
+
+@cache
+def cycle(gains: tuple[tuple[float, ...], ...], lag: float) -> ca.Function:
+    """Function (time, [q, v, acting command], command) -> (the same a cycle later, response), in ten steps."""
+    n, h = len(gains), PERIOD / 10
+    time, moving, now = ca.SX.sym("t"), ca.SX.sym("x", 3 * n), ca.SX.sym("u", n)
+    q, v, acting = ca.vertsplit(moving, n)
+    for i in range(10):
+        acting = now + (acting - now) * (np.exp(-h / lag) if lag else 0.0)
+        push = ca.sin(1.3 * (time + i * h) + np.arange(n))
+        a = ca.mtimes(ca.DM(gains), acting) - 0.5 * v - 2 * ca.sin(q) + push
+        q, v = q + h * v + h * h / 2 * a, v + h * a
+    return ca.Function("cycle", [time, moving, now], [ca.vertcat(q, v, acting), a])
+
+
+def body_problem(gains: float | list[list[float]], dead: int = 0, lag: float = 0.0, noise: float = 0.0) -> fp.Problem:
+    """Return the task of such a body, with the model of one or two masses."""
+    body = Body(np.atleast_2d(np.array(gains, dtype=float)), dead, lag, noise)
+    names, inputs = ["q", "p"][: len(body.gains)], ["u", "w"][: len(body.gains)]
+    model = fp.Plant(
+        dict.fromkeys(names, "m"),
+        dict.fromkeys(inputs, "m/s^2"),
+        {"b": fp.Parameter(1.0, 1.0, "1")},
+        lambda q, v, u, p: {name: p.b * u[i] for name, i in zip(names, inputs, strict=True)},
+    )
+    units = {"": "m", "'": "m/s", "''": "m/s^2"}
+    return fp.Problem(
+        plant=model,
+        reality=fp.ExternalPlant(body, measures={name + d: unit for d, unit in units.items() for name in names}),
+        reference=fp.Trajectory(lambda t: {name: 1 - ca.cos((2 + k) * t) for k, name in enumerate(names)}),
+        start=dict.fromkeys(names, 0.0),
+        period=PERIOD,
+        duration=8.0,
+        measure_from=1.0,
+        limits=fp.Limits(inputs=dict.fromkeys(inputs, (-60.0, 60.0))),
+        horizon=fp.Horizon(stages=20, step=5e-2),
+        cost=fp.Quadratic(
+            states={**dict.fromkeys(names, 100.0), **{f"{n}'": 5.0 for n in names}},
+            deviation=dict.fromkeys(inputs, 1.0),
+        ),
+    )
+
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),
@@ -21,6 +96,7 @@ KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (0.6, 0, 0.05, 0.05),
     (1.5, 2, 0.03, 0.3),
 ]
+
 NAMES = ("q", "p"), ("u", "w")
 
 
@@ -176,3 +252,64 @@ def test_a_wrong_recording_says_what_is_wrong(tmp_path, words):
     (tmp_path / "run.csv").write_text(WRONG_RECORDS[words])
     with pytest.raises(fp.FpirhcError, match=words):
         fp.probe(body_problem(1.0), RHC, recording=tmp_path / "run.csv")
+
+
+# Wrong uses of an external plant and of a probe, as a newcomer makes them, each with its whole message
+
+PROBLEM = body_problem(1.0)
+
+
+class Silent(Body):
+    """Its reset returns nothing."""
+
+    def reset(self, seed: int) -> Any:
+        del seed
+
+
+def outside(**settings: Any) -> Any:
+    """The task with another external plant."""
+    given: dict[str, Any] = {"body": Body(np.array([[1.0]])), "measures": QUANTITIES} | settings
+    return replace(PROBLEM, reality=fp.ExternalPlant(**given))
+
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "a function for a body": (
+        lambda: outside(body=lambda command: command),
+        "ExternalPlant: its body is a value of the class function without reset and step; expected an object with "
+        "reset(seed) and step(time, command)",
+    ),
+    "a body of another period": (
+        lambda: outside(period=2e-2),
+        "reality: one step of it takes 0.02, and the problem's period is 0.01; write both alike",
+    ),
+    "a start that returns nothing": (
+        lambda: fp.simulate(outside(body=Silent(np.array([[1.0]]))), RHC, seed=0, compiled=False),
+        "reality: reset of Silent returned None, expected 3 numbers: q, q', q''",
+    ),
+    "a parameter of a plant outside that has none": (
+        lambda: fp.Cases({"heavy": {"exact.mass": 2.0}}).problem("heavy", PROBLEM),
+        "cases: case 'heavy', 'exact.mass': 'exact.NAME' has a parameter of what moves, and there is no 'mass'. "
+        "No names are valid here.",
+    ),
+    "a negative amplitude": (
+        lambda: fp.probe(PROBLEM, RHC, amplitude=-1.0),
+        "probe(amplitude=-1.0): expected a number of at least 0, in the unit of the signal",
+    ),
+    "settings of an excitation beside a recording": (
+        lambda: fp.probe(PROBLEM, RHC, recording="run.csv", cycles=300),
+        "cycles is of an excitation, and a recording has been excited: leave one of them out",
+    ),
+    "the amplitude of an input": (
+        lambda: fp.probe(PROBLEM, RHC, amplitude={"u": 1.0}),
+        "probe(amplitude=...): 'u' is unknown. Valid: q.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_use_is_told_in_one_message(name):
+    """What, where, what was expected, the nearest name, and how to mend it; the place in the file comes before it."""
+    use, message = WRONG[name]
+    with pytest.raises(fp.FpirhcError) as caught:
+        use()
+    assert re.sub(r"^\S+\.py, line \d+: ", "", str(caught.value)) == message

@@ -11,6 +11,7 @@ from helpers import tasks
 from helpers.plants import chain, linear
 
 import fpirhc as fp
+from fpirhc.conformance import two_masses
 from fpirhc.contracts import Signal
 from fpirhc.errors import NotContractive
 
@@ -22,7 +23,9 @@ ESTIMATORS = (
     fp.SavitzkyGolay(window=7, degree=4),
     fp.SavitzkyGolay(window=11, degree=5),
 )
+
 NOISE = fp.Sensor(noise=fp.Noise(1.0))
+
 GENTLE = fp.Exponential(rate=0.01, integral=False)
 
 
@@ -50,21 +53,6 @@ def run(problem, controller=ADAPTIVE, seed=0, compiled=False):
     return fp.simulate(problem, controller, seed=seed, compiled=compiled)
 
 
-# --- laws of noise ---
-
-
-@pytest.mark.parametrize("gain", [0.2, 0.5, 1.0])
-def test_noise_gain_of_the_closed_loop(gain):
-    """Var r = a/(2 - a) sigma^2 and lag-1 correlation -a/2 of the seen error: bounds are four standard deviations."""
-    problem = resting(linear(1.0, 1.0), duration=20.0, sensing=fp.Sensing({"y''": NOISE}))
-    result = run(problem, fp.ComputedTorque(GENTLE, fp.Affine(gain=-2 * gain)))
-    requests, error = result["deformed.y"][100:], (result["realised.y"] - result["desired.y"])[100:]
-    memory = 1 - gain
-    spread = 4 * math.sqrt(2 / requests.size * (1 + memory**2) / (1 - memory**2))
-    assert np.var(requests) == pytest.approx(gain / (2 - gain), rel=spread)
-    assert np.corrcoef(error[1:], error[:-1])[0, 1] == pytest.approx(-gain / 2, abs=4 / math.sqrt(error.size))
-
-
 def test_coloured_noise_has_its_deviation_and_memory():
     """Standard deviation and correlation exp(-T / correlation time), within four standard deviations."""
     times = 1e-3 * np.arange(200_000)
@@ -75,7 +63,7 @@ def test_coloured_noise_has_its_deviation_and_memory():
     assert np.corrcoef(values[1:], values[:-1])[0, 1] == pytest.approx(decay, abs=4 / math.sqrt(times.size))
 
 
-# --- sensors in the loop ---
+# Sensors in the loop
 
 
 def test_nothing_and_zero_noise_are_the_ideal_loop():
@@ -129,7 +117,7 @@ def test_order_of_sensor_dead_time_and_controller():
     assert fp.measure(problem, result)["max_error"]["y"] == np.abs(result["true_error.y"]).max()
 
 
-# --- estimators ---
+# Estimators
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
@@ -207,7 +195,7 @@ def test_deformation_waits_for_the_window(estimator):
     assert result["state.y'"][0] == pytest.approx(1.0)
 
 
-# --- stability ---
+# Stability
 
 
 def limit_of(weights: np.ndarray, pairing: float) -> float:
@@ -277,7 +265,7 @@ def test_dead_time_counts_but_is_not_judged_alone():
     run(window, fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Paired(fp.Affine(gain=-1.0), cycles=11.5)))
 
 
-# --- another reality begins with its own estimates ---
+# Another reality begins with its own estimates
 
 
 def sensed_slowly(gain: float) -> fp.Problem:
@@ -311,3 +299,93 @@ def test_another_reality_begins_with_its_own_estimates():
         assert np.array_equal(shared["state"], own["state"])
         assert np.array_equal(shared["command"], own["command"])
         assert abs(shared["state.y"][0] - 1.3 * 0.1) < 1e-12
+
+
+# What is wrong with sensing is said where it is stated: what, where, what was expected, and how to mend it
+
+FIT, KALMAN = fp.SavitzkyGolay, fp.KalmanFilter(measured={"y": 0.1}, noise={"y": 1.0})
+
+
+def task(**sensing: Any) -> fp.Problem:
+    return resting(linear(1.0, 0.7), sensing=fp.Sensing(**sensing))
+
+
+def of_output(**sensing: Any) -> fp.Problem:
+    plant = fp.Plant.of_states(
+        states={"C": "mg/l", "E": "mg/l"},
+        inputs={"u": "mg/l/min"},
+        parameters={},
+        rates=lambda x, u, p: {"C": u.u - x.C, "E": 0.5 * (x.C - x.E)},
+        outputs={"depth": fp.Output("1", lambda x, p: 93 / (1 + x.E))},
+    )
+    still, start = fp.Trajectory(lambda t: {"depth": 0 * t}), {"C": 1.5, "E": 1.5}
+    sensing = {"estimator": fp.PositionDifference(), "measured": ["depth"]} | sensing
+    return resting(plant, reference=still, start=start, sensing=fp.Sensing(**sensing))
+
+
+def stepped(call: str, *arguments: Any) -> None:
+    one = fp.Stepper(task(estimator=fp.PositionDifference()), fp.ComputedTorque(fp.Exponential(6.0)), compiled=False)
+    getattr(one, call)(0.0, *arguments, one.start())
+
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "deviation": (lambda: fp.Noise(-1.0), "Noise.deviation: expected a finite number of at least 0"),
+    "no deviation": (lambda: fp.Noise(math.nan), "got nan"),
+    "a number for noise": (lambda: fp.Sensor(noise=0.1), "Sensor.noise: expected a Disturbance or None, got 0.1"),  # type: ignore[arg-type]
+    "quantum": (lambda: fp.Sensor(quantum=0.0), "Sensor.quantum: expected a finite number above 0"),
+    "two mistakes": (lambda: fp.Sensor(quantum=-1.0, dropout=1.0), "dropout: expected a number from 0 to below 1"),
+    "range": (lambda: fp.Sensor(range=(1.0, 0.0)), "lower < upper"),
+    "range of what is followed": (
+        lambda: task(sensors={"y": fp.Sensor(range=(0.5, 0.9))}),
+        "the reference of 'y' goes from 0 to 0, but its sensor shows 0.5 to 0.9",
+    ),
+    "even window": (lambda: FIT(window=10, degree=2), "use 9 or 11"),
+    "smallest window": (lambda: FIT(window=2, degree=1), "at least 3 samples for degree 1; use 3"),
+    "short window": (lambda: FIT(window=3, degree=3), "at least 5"),
+    "window of a float": (lambda: FIT(window=5.0, degree=2), "expected a whole number from 1 to 1001, got 5.0"),  # type: ignore[arg-type]
+    "low degree": (lambda: task(estimator=FIT(5, 1)), "use a degree of at least 2"),
+    "time constant": (lambda: fp.LowPassDifference(time_constant=0.0), "VelocityDifference()"),
+    "pole": (lambda: fp.Filtered(fp.Affine(gain=-1.0), pole=1.0), "pole: expected a number from 0 to below 1, got 1.0"),
+    "sensor of nobody": (lambda: task(sensors={"yy": fp.Sensor()}), "quantity 'yy' is unknown. Did you mean 'y"),
+    "sensor of an estimate": (
+        lambda: task(sensors={"y'": fp.Sensor()}, estimator=FIT(5, 2)),
+        "'y'' is estimated by SavitzkyGolay, not measured; sensors are those of y",
+    ),
+    "measured name": (lambda: task(measured=["Y"], observer=KALMAN), "measured: quantity 'Y'"),
+    "no observer": (
+        lambda: task(measured=["y"], estimator=fp.Measured()),
+        "also needs y', y''; measure it, or estimate it by an observer",
+    ),
+    "filter of what no sensor shows": (
+        lambda: task(measured=["y"], observer=fp.KalmanFilter(measured={"y'": 0.1}, noise={"y": 1.0})),
+        "no sensor shows 'y''; Sensing(measured=...) has y",
+    ),
+    "noise of nobody": (
+        lambda: task(measured=["y"], observer=fp.KalmanFilter(measured={"y": 0.1}, noise={"yy": 1.0})),
+        "noise: coordinate 'yy' is unknown. Did you mean 'y'",
+    ),
+    "no noise": (lambda: fp.KalmanFilter(measured={"y": 0.1}, noise={}), "name at least one"),
+    "a state of outputs": (
+        lambda: of_output(measured=["depth", "C"]),
+        "C is given as it is to controllers of a plant with outputs, unless an observer is stated",
+    ),
+    "filter of a state behind outputs": (
+        lambda: of_output(observer=fp.KalmanFilter(measured={"C": 0.1}, noise={"C": 1.0})), "no sensor shows 'C'"
+    ),
+    "estimates for samples": (lambda: stepped("step", np.zeros(2), np.zeros(1)), "use step_measured(time, measured, memory)"),
+    "samples": (lambda: stepped("step_measured", np.zeros(3)), "'measured' has 1 entries"),
+    "samples of two": (
+        lambda: fp.Stepper(two_masses(), fp.ComputedTorque(fp.Exponential(6.0)), compiled=False).step_measured(
+            0.0, np.zeros(4), np.zeros(9)
+        ),
+        "'measured' has 6 entries",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_sensing_says_what_was_expected(name):
+    make, words = WRONG[name]
+    with pytest.raises(fp.FpirhcError) as caught:
+        make()
+    assert words in " ".join(str(caught.value).split())

@@ -1,10 +1,10 @@
-"""Tracking laws: gains and integrals; of fractional order Mittag-Leffler decay, weights and memory."""
+"""Tracking laws: gains, integrals and what they do while a limit acts; of fractional order Mittag-Leffler decay and memory."""
 
 import math
 
 import numpy as np
 import pytest
-from helpers.plants import chain
+from helpers.plants import chain, simulated
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
@@ -26,8 +26,8 @@ def problem(order=1, *, period=1e-3, duration=2.002, **settings):
     return fp.Problem(plant=chain(order), period=period, duration=duration, **settings_in_use)
 
 
-def run(task, tracking, *, compiled=False):
-    return fp.simulate(task, fp.ComputedTorque(tracking), seed=0, compiled=compiled)
+def run(task, tracking):
+    return simulated(task, fp.ComputedTorque(tracking))
 
 
 def decaying(result, order, rate):
@@ -55,6 +55,7 @@ def test_closed_loop_follows_mittag_leffler(order, beta, after):
 
 
 LARGEST = (0.05,)  # m/s^n: what limits are said to allow
+
 LAWS = (  # with (g_0, g_1) for order 1 and for order 2
     (fp.Exponential(2.0, bumpless=False, largest=LARGEST), (4, 4), (8, 12)),
     (fp.ShiftPolynomial(0.98, step=0.01, largest=LARGEST), (4, 4), (8, 12)),
@@ -131,3 +132,66 @@ def test_bad_settings_are_refused(settings):
     """No decay from order 2 on, and no memory shorter than the decay it is to hold."""
     with pytest.raises(InvalidValue, match="expected"):
         fp.Fractional(**settings)
+
+
+# An integral goes no further into a limit, comes back out, and follows its own coordinate alone
+
+LAW = fp.Exponential(rate=2.0)
+
+
+def heater(start: float, goal: float) -> fp.Problem:
+    """A heater x' = u - x with u from 0 to 1."""
+    plant = fp.Plant({"x": "K"}, {"u": "W"}, {}, lambda q, u, p: {"x": u.u - q.x}, order=1)
+    reference = fp.Trajectory(lambda t: {"x": goal + 0 * t})
+    limits = fp.Limits(inputs={"u": (0.0, 1.0)})
+    return fp.Problem(plant, reference, {"x": start}, period=0.02, duration=30.0, limits=limits)
+
+
+def two_heaters() -> fp.Problem:
+    """Two that know nothing of each other; b has a load that the model lacks."""
+    plant = fp.Plant(
+        {"a": "K", "b": "K"},
+        {"u": "W", "v": "W"},
+        {"load": fp.Parameter(0.0, 1.0, "1")},
+        lambda q, u, p: {"a": u.u - q.a, "b": u.v - q.b - 0.5 * p.load},
+        order=1,
+    )
+    reference = fp.Trajectory(lambda t: {"a": 2.0 + 0 * t, "b": 0.3 + 0 * t})
+    limits = fp.Limits(inputs={"u": (-1.0, 1.0), "v": (-5.0, 5.0)})
+    return fp.Problem(plant, reference, {"a": 0.0, "b": 0.0}, period=0.02, duration=20.0, limits=limits)
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        fp.ComputedTorque(LAW),
+        fp.ComputedTorque(fp.ShiftPolynomial(poles=0.96, step=0.02)),
+        fp.Slotted({"x": fp.ComputedTorque(LAW)}, {"x": 1.0}, blend=0.1),
+        fp.PID({"x": 2.0}, {"x": 1.0}),
+        fp.rivals.LyapunovMRAC(2.0, adaptation=1.0),
+    ],
+    ids=["exponential", "shift polynomial", "slot", "PID", "gains"],
+)
+def test_the_error_takes_an_integral_out_of_a_limit(controller):
+    """A bumpless start from far above loads the integral with heat; frozen there, 1 K would stay for ever."""
+    assert simulated(heater(3.0, 0.5), controller)["state.x"][-1] == pytest.approx(0.5, abs=1e-3)
+
+
+@pytest.mark.parametrize("controller", [fp.ComputedTorque(LAW), fp.PID({"x": 2.0}, {"x": 1.0})], ids=["law", "PID"])
+def test_an_integral_goes_no_further_into_a_limit(controller):
+    """At full power 2 K are out of reach, and an error of 1 K stays; the command asks for hardly more than there is."""
+    assert 1 < simulated(heater(0.0, 2.0), controller)["command_unclipped.u"][-1] < 1.1
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        fp.ComputedTorque(LAW),
+        fp.PID(dict.fromkeys("ab", 2.0), dict.fromkeys("ab", 1.0)),
+        fp.rivals.LyapunovMRAC(2.0, adaptation=10.0),
+    ],
+    ids=["law", "PID", "gains"],
+)
+def test_a_limit_of_one_coordinate_stops_no_other_integral(controller):
+    """The integral of b takes its load off also while a asks for what its input cannot give."""
+    assert simulated(two_heaters(), controller)["state.b"][-1] == pytest.approx(0.3, abs=1e-3)
