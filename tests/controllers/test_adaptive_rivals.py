@@ -32,14 +32,10 @@ def hardening(exact=(1.0, 0.5, 20.0, 3.0), believed=(1.5, 0.0, 12.0, 0.0)):
 
 BOX = {"m": (0.1, 40.1), "b": (-20.0, 20.0), "k": (-10.0, 30.0), "c": (-20.0, 20.0)}  # equal widths: no scaling
 TRACKING = fp.Exponential(rate=4.0)
-SIGMOID = fp.Sigmoid(gain=-1.0, scale=50.0)
 ADAPTATION = fp.LyapunovRule({"m": 1e2, "b": 1e3, "k": 1e4, "c": 1e4})
 GENTLE = fp.LyapunovRule({"m": 1.0, "b": 10.0, "k": 100.0, "c": 100.0})
 AID = fp.rivals.AdaptiveInverseDynamics(TRACKING, ADAPTATION, BOX)
 NLMS = fp.rivals.AdaptiveInverseDynamics(TRACKING, fp.Projection(gain=0.02), BOX)
-SLOTINE_LI = fp.rivals.SlotineLi(4.0, {"q": 8.0}, GENTLE, dict.fromkeys(BOX, FREE))
-NLMS_FPI = replace(NLMS, deformation=SIGMOID)
-SLOTINE_LI_FPI = fp.rivals.SlotineLi(4.0, {"q": 8.0}, fp.Projection(gain=0.02), BOX, deformation=SIGMOID)
 
 
 def rich(t):
@@ -67,13 +63,10 @@ def ran(controller, motion=poor, duration=20.0):
 
 CONTROLLERS = {
     "CT": fp.ComputedTorque(TRACKING),
-    "CT+FPI": fp.ComputedTorque(TRACKING, SIGMOID),
     "AID": AID,
-    "AID+FPI": replace(AID, deformation=SIGMOID),
     "NLMS": NLMS,
-    "NLMS+FPI": NLMS_FPI,
-    "Slotine-Li": SLOTINE_LI,
-    "Slotine-Li+FPI": SLOTINE_LI_FPI,
+    "NLMS+FPI": replace(NLMS, deformation=fp.Sigmoid(gain=-1.0, scale=50.0)),
+    "Slotine-Li": fp.rivals.SlotineLi(4.0, {"q": 8.0}, GENTLE, dict.fromkeys(BOX, FREE)),
 }
 
 
@@ -82,32 +75,13 @@ def largest(run, begin, end):
     return float(np.abs(run["error"][round(1000 * begin) : round(1000 * end)]).max())
 
 
-@pytest.mark.parametrize("name", ["AID", "NLMS", "Slotine-Li"])
+@pytest.mark.parametrize("name", ["AID", "NLMS", "NLMS+FPI", "Slotine-Li"])
 @pytest.mark.parametrize("motion", [poor, rich])
 def test_learning_ends_the_tracking_error(name, motion):
     """Without learning 0.15 to 0.17 m for ever; with it less than a tenth of that in the last 5 s, excited or not."""
     assert largest(ran("CT", motion), 15, 20) > 0.14
     assert largest(ran(name, motion), 15, 20) < 0.01
     assert (CONTROLLERS[name].learns, CONTROLLERS["CT"].learns) == (True, False)
-
-
-@pytest.mark.parametrize("name", ["Slotine-Li", "NLMS", "NLMS+FPI"])
-def test_parameters_converge_under_excitation(name):
-    """The well-excited ones (b, k) to 6 % in 20 s, the whole vector to a quarter of its first error."""
-    exact, first = (np.array(v) for v in ((1.0, 0.5, 20.0, 3.0), (1.5, 0.0, 12.0, 0.0)))
-    result = ran(name, rich)["estimate"][-1]
-    np.testing.assert_allclose(result[[1, 2]], exact[[1, 2]], rtol=0.08)
-    assert np.linalg.norm(result - exact) < 0.25 * np.linalg.norm(first - exact)
-
-
-def test_lyapunov_function_of_slotine_and_li_falls():
-    """V = (M rho^2 + (p - p_hat)^T Gamma^-1 (p - p_hat)) / 2 falls; a cycle adds at most what holding the command costs."""
-    run = ran("Slotine-Li", rich)
-    exact, gains = np.array([1.0, 0.5, 20.0, 3.0]), np.array(list(GENTLE.gains.values()))
-    value = 0.5 * (run["sliding"][:, 0] ** 2 + ((exact - run["estimate"]) ** 2 / gains).sum(axis=1))
-    assert np.diff(value).max() < 1e-4 * value[0]
-    assert value[-1] < 0.1 * value[0]
-    assert np.maximum.accumulate(value[::200])[-1] == value[0]
 
 
 # The two-link arm of the book.
@@ -190,24 +164,10 @@ def test_dead_zone_ends_learning():
     np.testing.assert_allclose(change(matrix, 4.0).full(), 0.5 * full, rtol=1e-9)
 
 
-def test_lyapunov_rule_waits_while_the_command_is_clipped():
-    """The gradient assumes that the plant got the command."""
-    rule, bounds = fp.LyapunovRule({"p0": 2.0}), {"p0": FREE}
-    steps = [
-        rule.change(evidence(gradient=lambda: (ca.DM([3.0]), ca.DM([5.0])), clipped=clipped), bounds, 0.1)
-        for clipped in (0, 1)
-    ]
-    assert [float(s) for s in steps] == pytest.approx([3.0, 0.0])
-
-
-def evidence(gradient: Any = None, equation: Any = None, clipped: Any = 0) -> Any:
-    """Only what the rule asks for."""
-    return SimpleNamespace(gradient=gradient, equation=equation, clipped=clipped)
-
-
 def rule_step(rule, bounds, rows):
     matrix, error = ca.SX.sym("G", rows, len(bounds)), ca.SX.sym("h", rows)
-    return ca.Function("rule", [matrix, error], [rule.change(evidence(equation=lambda: (matrix, error)), bounds, 1e-3)])
+    evidence: Any = SimpleNamespace(equation=lambda: (matrix, error))  # all that the rule asks for
+    return ca.Function("rule", [matrix, error], [rule.change(evidence, bounds, 1e-3)])
 
 
 def test_mass_matrix_stays_positive_definite():
@@ -229,10 +189,12 @@ def test_mass_matrix_stays_positive_definite():
         assert np.linalg.eigvalsh(0.5 * (gain + gain.T))[0] > 0
 
 
-def test_projection_learns_while_the_command_is_clipped():
-    """It knows the command that acted, not the one that was asked for."""
+def test_while_the_command_is_clipped_a_gradient_waits_and_a_projection_learns():
+    """The gradient assumes that the plant got the command; the projection knows the one that acted."""
     problem = replace(task(rich, 3.0), limits=fp.Limits(inputs={"u": (-8.0, 8.0)}))
-    run = fp.simulate(problem, NLMS, seed=0, compiled=False)
+    waits, run = (fp.simulate(problem, one, seed=0, compiled=False) for one in (AID, NLMS))
+    clipped, changes = waits["clipped"][:-1, 0] > 0, np.abs(np.diff(waits["estimate"], axis=0)).max(axis=1)
+    assert changes[clipped].max() == 0 < changes[~clipped].min()
     assert run["clipped"].mean() > 0.2
     exact = np.array([1.0, 0.5, 20.0, 3.0])
     errors = np.linalg.norm(exact - run["estimate"], axis=1)
