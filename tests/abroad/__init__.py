@@ -2,7 +2,6 @@
 
 cstr             do-mpc's reactor, exact model; variant `wrong`
 quadruple_tank   Johansson's four tanks, minimum phase; variant `nonminimum`
-flexible_servo   a load on a flexible shaft, whose mismatch the controlled motor does not feel
 drug_infusion    propofol with compartments that have no reference, the wrong kinetics as model
 own_map          a user's own deformation and a dead time; controller `unpaired`
 """

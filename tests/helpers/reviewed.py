@@ -115,7 +115,7 @@ def biased(size: float) -> fp.Problem:
 
 
 def servo() -> fp.Problem:
-    """The servomechanism of `abroad.flexible_servo`, whose load is controlled: the model's load is half as heavy."""
+    """A load on a flexible shaft is controlled (Bemporad and Mosca, Automatica 34(4), 1998): the model's is half as heavy."""
 
     def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
         twist = x.load - x.motor / 20.0

@@ -1,1 +1,0 @@
-"""Attacks on loops, files and processes: what a machine must survive."""
