@@ -26,6 +26,7 @@ _OF_CASADI = (
     "math, numpy, float() and int() cannot act on a symbol; use CasADi's functions (import casadi as ca; ca.sin, ca.exp, ca.atan2, "
     "ca.fmax, ca.if_else)"
 )
+_USUAL = {"ca": "casadi as ca", "np": "numpy as np", "fp": "fpirhc as fp", "math": "math"}
 
 
 def called(what: str, function: Callable[..., Result], *arguments: object) -> Result:
@@ -90,6 +91,8 @@ def explained(error: BaseException) -> str:
     if isinstance(error, AttributeError) and is_dataclass(error.obj):
         valid = [one.name for one in fields(error.obj)]
         return f"a {type(error.obj).__name__} has no '{error.name}'.{nearest(error.name, valid)}"
+    if isinstance(error, NameError) and (module := _USUAL.get(str(error.name))):
+        return f"'{error.name}' is not imported; write import {module} at the top of the file"
     symbols = re.search(r"\b(SX|MX|to_double|to_int|new_SX|new_MX)\b", text) is not None
     first = text.strip().partition("\n")[0]
     return f"{type(error).__name__}: {first}{f'; {_OF_CASADI}' if symbols else ''}"

@@ -107,7 +107,8 @@ def _wrong_arguments(plant: Plant) -> Iterator[str]:
         kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
         arguments, fitting = len(kinds), order + len(kinds) - expected
         of_states = "; equations in states go to Plant.of_states(rates=...)"
-        mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else of_states
+        fits = f"; {function}({', '.join(_LOWER[:fitting])}, u, p) is that of Plant(..., order={fitting})"
+        mend = fits if fitting > 0 else of_states
         mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
         yield (
             f"{function} takes {arguments} argument{'s' * (arguments != 1)}{f' ({place})' if place else ''}; "

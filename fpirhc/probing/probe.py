@@ -172,9 +172,13 @@ def _cautions(problem: Problem, record: Record, estimates: Estimates, chosen: De
     each = zip(problem.plant.controlled_names, problem.plant.inputs, record.limited, estimates.channels, strict=True)
     for row, (name, u, limited, one) in enumerate(each):
         wide = max(gain.high - gain.low for gain in one.gains) / 2 / max(abs(one.gains[row].value), 1e-300)
-        if (more := wide / _WIDE) > 1 and not estimates.refused:
-            mend = f"{more:.2g} times the amplitude, or {more**2:.2g} times the cycles, would make that {100 * _WIDE:.0f} %"
-            yield f"the gain ratio of {name} is only known to {100 * wide:.0f} %: {mend}"
+        if (more := wide / _WIDE) > 1 and estimates.least_at_most > 0:
+            usual = float(record.amplitude[row]) if record.amplitude else 0.0
+            size = min(more * usual, max(usual, float(record.room[row])))  # within the limits
+            longer = (more * usual / size if size else more) ** 2
+            needs = [f"an amplitude of {number(size)}"] * (size > usual)
+            needs += [f"{longer:.2g} times the cycles"] * (longer > 1.05)
+            yield f"the gain ratio of {name} is only known to {100 * wide:.0f} %; {100 * _WIDE:.0f} % needs {' and '.join(needs)}"
         if limited > _LIMITED:
             yield f"{u} is at a limit in {100 * limited:.0f} % of the cycles, which tells little: excite less, or widen its limits"
         around, known = problem.dead_time.measurement, problem.dead_time.inputs.get(u, 0.0)

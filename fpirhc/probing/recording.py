@@ -63,6 +63,7 @@ class Record:
     shown: tuple[str, ...]  # what each response is a difference of, or itself where it is measured
     differences: tuple[int, ...]  # how often
     limited: np.ndarray  # share of the cycles in which each command stands at a limit
+    room: np.ndarray  # amplitude of every response that goes half of the way between the limits of the inputs
     stop: str  # why the run ended early; empty where it did not
     amplitude: tuple[float, ...] = ()  # of the excitation of every response; empty: a recording
 
@@ -80,7 +81,9 @@ def _record(
         raise InvalidValue(f"{where}: {one}; let it step, leave it room within its limits, or check the model's sign")
     told, parameters = model_values(plant, problem.signals), plant.approximate
     known = parameters if told is None else told.map(len(times) - 1)(times[None, 1:], parameters)
-    modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, known)).T
+    respond = lambda sent: np.array(plant.equations.controlled_response(states[1:].T, sent, known)).T  # noqa: E731
+    modelled, bounds = respond(commands[:-1].T), problem.limits.input_bounds(plant)
+    low, high = (respond(np.tile(np.clip(one, -1e100, 1e100)[:, None], len(times) - 1)) for one in bounds)
     measured, shown = np.full((len(times), len(plant.response_orders)), np.nan), list[str]()
     for column, (name, order) in zip(measured.T, plant.response_orders.items(), strict=True):
         shown.append(max((n for n in seen if n.rstrip("'") == name), key=len))
@@ -88,10 +91,12 @@ def _record(
         column[missing:] = np.diff(seen[shown[-1]], missing) / problem.period**missing
     differences = tuple(n - one.count("'") for n, one in zip(plant.response_orders.values(), shown, strict=True))
     both = pd.DataFrame(np.hstack([measured[1:], modelled])).replace([np.inf, -np.inf], np.nan)
-    limited = np.isclose(commands, np.array(problem.limits.input_bounds(plant))[:, None]).any(axis=0).mean(axis=0)
+    limited = np.isclose(commands, np.array(bounds)[:, None]).any(axis=0).mean(axis=0)
+    room = np.median(np.abs(high - low), axis=0) / 4
     # What does not count passes through filters, as lines between what does.
     parts = np.hsplit(both.interpolate(limit_direction="both").fillna(0.0).to_numpy(), [measured.shape[1]])
-    return Record(parts[0], parts[1], both.notna().all(axis=1).to_numpy(), tuple(shown), differences, limited, stop)
+    usable = both.notna().all(axis=1).to_numpy()
+    return Record(parts[0], parts[1], usable, tuple(shown), differences, limited, room, stop)
 
 
 def _preferred(first: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

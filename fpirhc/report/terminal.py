@@ -73,7 +73,8 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
     `verbose`: print every sentence, every column and everything else that is said of a study.
     """
     say(view.study.title, "bold", f" {view.conditions}")
-    show_sentences(one for k, one in enumerate(view.sentences) if verbose or not k or one[1] in IN_FULL)
+    for k, (text, outcome) in enumerate(view.sentences):
+        say(f"- {text}", STYLES.get(outcome, "")) if verbose or not k or outcome in IN_FULL else None
     say(f"other pairs: {view.others}") if view.others and not verbose else None
     for table in view.tables:
         if table.rows:
@@ -108,12 +109,6 @@ def show_brief(table: Table, console: Console | None = None) -> None:
         below.append(f"more columns by --verbose: {', '.join(more)}")
     for text in below:
         say(text)
-
-
-def show_sentences(sentences: Iterable[tuple[str, Outcome | None]]) -> None:
-    """Print sentences in the colours of the outcomes that they state."""
-    for text, outcome in sentences:
-        say(f"- {text}", STYLES.get(outcome, ""))
 
 
 def show_table(table: Table, console: Console | None = None) -> None:

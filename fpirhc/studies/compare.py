@@ -59,8 +59,8 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            more = " ".join([*(change for _, change, _ in slips(task.problem)), *filter(None, [best])])
-            owners.setdefault(f"{error}{more and f'. {more}'}", []).append(f"'{name}'")
+            told = " ".join([*_slips(task.problem), f"{error}{best and f'. {best}'}"])
+            owners.setdefault(told, []).append(f"'{name}'")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     for why, names in owners.items():
@@ -256,8 +256,12 @@ def compare(
 def _causes(problem: Problem, entries: Sequence[Entry], yard: Yardstick) -> list[str]:
     """What the file itself says of loops that do not follow, or leave a limit."""
     placed = [f"{text[0].upper()}{text[1:]}." for text in misplaced(problem)]
-    lost = any(not e.adaptive and not follows(e, yard) for e in entries)
-    return [*placed, *(f"{told[0].upper()}{told[1:]}. {change}" for told, change, _ in slips(problem) if lost)]
+    lost = any(not e.adaptive and (not follows(e, yard) or yard.shortfalls(e, True)) for e in entries)
+    return placed + lost * _slips(problem)
+
+
+def _slips(problem: Problem) -> list[str]:
+    return [f"{told[0].upper()}{told[1:]}. {change}" for told, change, _ in slips(problem)]
 
 
 class _Rows:

@@ -490,16 +490,6 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows.get(e.name, math.inf))}
     if fair:
         least, best = min((v, n) for n, v in fair.items())
-        among, some = " with the wrong model" * any(e.exact for e in entries), any(follows(e, yard) for e in entries)
+        among = " with the wrong model" * any(e.exact for e in entries)
         text = f"Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
-        yield text if some else "No controller follows; fpirhc review says why."
-    for exact in (e for e in entries if e.exact):
-        beaten = [n for n, v in fair.items() if v < HELPS * rows.get(exact.name, math.inf)]
-        if beaten and any(follows(e, yard) for e in entries):
-            why = f"{in_percent(_unsolved(exact))} of its plans did not converge, and " * (_unsolved(exact) > UNSOLVED)
-            yield f"{exact.name} is no lower bound: {why}errors are smaller with {', '.join(beaten)}."
-    for entry in entries:
-        if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:
-            lost = [n for n in entry.errors if yard.beyond(entry, n)]
-            if lost:
-                yield f"{entry.name} does not follow its reference: the rms error of {', '.join(lost)} is larger than the motion."
+        yield text if any(follows(e, yard) for e in entries) else "No controller follows; fpirhc review says why."

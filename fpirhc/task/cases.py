@@ -180,7 +180,7 @@ def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> 
         # A case with a reality of its own means the parameters of that one.
         there = settable(changed_at(problem, "reality", changes["reality"]) if "reality" in changes else problem, word)
         if name not in there:
-            raise InvalidName(f"'{word}.NAME' has a {WORDS[word]}, and there is no '{name}'.{nearest(name, there)}")
+            raise InvalidName(f"no {WORDS[word]} is called '{name}'.{nearest(name, there)}")
         _check_number(changes[path], *there[name][1:])
     else:
         paths = [f.name for f in fields(problem) if f.name not in _OWN]

@@ -116,7 +116,7 @@ def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
     """Return how many control cycles one stage of the horizon lasts."""
     ratio = horizon.step / period
     if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
-        whole, slip = max(1, round(ratio)), "; is one of the two in ms?" * (ratio < 0.01 and unit == "s")
+        whole, slip = max(1, round(ratio)), f"; is {period:g} ms meant?" * (ratio <= 0.1 and unit == "s")
         raise InvalidValue(
             f"period {period:g} {unit} does not divide the horizon step {horizon.step:g} {unit}; "
             f"use a step of {whole * period:.12g} {unit} or a period of {horizon.step / whole:.12g} {unit}{slip}"

@@ -97,10 +97,6 @@ names of another tool
 limits of unknown names
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"tau": (-15.0, 15.0)}, states={"angle_dot": (-3, 3)})
     input 'tau' is unknown. Valid: torque. ... state 'angle_dot' is unknown. Did you mean "angle'"?
-cost by matrices
-  fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) ->
-      fp.Quadratic(Q=np.diag([1e3, 1.0]), R=np.eye(1))
-    no field 'Q'. Did you mean 'states'? ... no field 'R'. Did you mean 'effort'?
 cost as a function
   fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) -> lambda x, u: x[0] ** 2
     Problem.cost: expected a Cost or None, got the function <lambda>(x, u); one of CustomCost, Quadratic
@@ -120,19 +116,18 @@ response that divides by zero
   ca.sin(q.angle) -> ca.sin(q.angle) / q.angle
     the response of 'angle' (approximate parameters) is not finite at the start (angle = 0, angle' = 0) ... start elsewhere, or
     mend a root or a division in mine.py, line 7
-period of zero
-  period=1e-2 -> period=0
-    Problem.period: expected a number from 1e-12 to 1e12 in the plant's unit of time, got 0
+a module that is not imported
+  ca.sin(q.angle) -> math.sin(q.angle)
+    response (mine.py, line 9): 'math' is not imported; write import math at the top of the file
+another order
+  order=2, -> order=1,
+    with order 1 it is called as response(q, u, p); response(q, v, u, p) is that of Plant(..., order=2)
 disturbance without a name
   measure_from=0.05 -> disturbances=fp.Step(0.1, 1.0)
     expected {name: a Disturbance}, got a value of the class Step; write {'NAME': Step(...)} with the name of what it belongs to
 class of another tool
   {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> {"MPC": fp.MPC(optimiser)}
     fpirhc has no name 'MPC'. Did you mean 'RecedingHorizon'? ... more.
-one controller
-  {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> fp.RecedingHorizon(optimiser)
-    line 36: controllers: expected {name: a Controller}, got a value of the class RecedingHorizon; write {'NAME':
-    RecedingHorizon(...)}
 start outside the limits
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"torque": (-15.0, 15.0)}, states={"angle": (0.5, 2.5)})
     no Do states, rates and paths keep their limits? ... A limit of angle is left ... by at most 0.5 rad
@@ -260,8 +255,8 @@ study mine.py --over deformation.map.gain=1:2 => expected PATH=LOW:HIGH:COUNT
 study mine.py --over deformation.map.gian=1:2:3 => has no 'gian'. Did you mean 'gain'?
 run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number other than zero ... got nan
 run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
-compare mine.py --set exact.mass=-1 => 'RHC+FPI': mass of the plant and of the model differ in sign: ... the plant's sign
-run mine.py RHC --set period=5 => or a period of ... is one of the two in ms?
+compare mine.py --set exact.mass=-1 => In the model mass is -1.4 times the plant's. ... differ in sign: ... the plant's sign
+run mine.py RHC --set period=5 => or a period of ... is 5 ms meant?
 run mine.py RHC --set dead_time.measurement=50 => more than 1000 control cycles ... is one of the two in ms?
 run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file
 tune mine.py => no search space ... add to its file, for example, tuning =

@@ -145,6 +145,14 @@ def test_a_gain_that_noise_hides_has_no_certain_sign(tmp_path):
     assert found.gain["q"]["q"].low < 0 < found.gain["q"]["q"].high
     assert found.why.startswith("the sign of a gain is not certain")
 
+    def notes(amplitude: float, most: float = 60.0) -> str:  # what makes it certain is named, within the limits
+        loud = replace(body_problem(1.0, noise=1.0), limits=fp.Limits(inputs={"u": (-most, most)}))
+        return " ".join(fp.probe(loud, RHC, amplitude=amplitude, cycles=150, trials=False).notes)
+
+    needed = notes(0.3).partition("20 % needs an amplitude of ")[2]
+    assert "needs" not in notes(1.1 * float(needed))
+    assert "20 % needs an amplitude of 0.4 and " in notes(0.3, most=0.8)
+
 
 @pytest.mark.parametrize(("window", "noise"), [(7, 1e-4), (61, 1e-4), (7, 0.0)])
 def test_the_window_of_an_estimator_is_in_no_estimate(window, noise, tmp_path):
@@ -288,8 +296,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "a parameter of a plant outside that has none": (
         lambda: fp.Cases({"heavy": {"exact.mass": 2.0}}).problem("heavy", PROBLEM),
-        "cases: case 'heavy', 'exact.mass': 'exact.NAME' has a parameter of what moves, and there is no 'mass'. "
-        "No names are valid here.",
+        "cases: case 'heavy', 'exact.mass': no parameter of what moves is called 'mass'. No names are valid here.",
     ),
     "a negative amplitude": (
         lambda: fp.probe(PROBLEM, RHC, amplitude=-1.0),

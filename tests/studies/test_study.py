@@ -209,7 +209,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no case": (lambda t: fp.Cases({}), "there is none; expected "),
     "the name of all": (lambda t: fp.Cases({"all": {}}), "'all' means every case"),
     "a group that is no text": (lambda t: fp.Cases({"weak": {"group": 1}}), "case 'weak': 'group' is a text, got 1"),
-    "a parameter that is not there": (of_case({"exact.c": 1.0}), r"'exact\.c': .* there is no 'c'\. .*Valid: b, k"),
+    "a parameter that is not there": (of_case({"exact.c": 1.0}), r"'exact\.c': .* is called 'c'\. .*Valid: b, k"),
     "a parameter alone": (of_case({"b": 1.0}), r"Write 'exact\.b' \(parameter of what moves\) or 'approximate\.b'"),
     "a field that is misspelt": (of_case({"dead_tme.measurement": 0.1}), r"'dead_tme.*Did you mean 'dead_time'\?"),
     "outside its bounds": (of_case({"exact.b": -70.0}), r"'exact\.b': expected 0\.5 to 2\.4 1/kg, got -70"),

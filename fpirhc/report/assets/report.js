@@ -121,13 +121,8 @@ function fit() {
 
 function show() {
   for (const { chart, box, spec } of plots) {
-    if (spec.only) {
-      box.hidden = !shown.has(spec.only) || shown.size > 2;
-      continue;
-    }
-    spec.series.forEach((s, k) => {
-      if (s.name in colors) chart.setSeries(k + 1, { show: shown.has(s.name) });
-    });
+    if (spec.only) box.hidden = !shown.has(spec.only) || shown.size > 2;
+    else spec.series.forEach((s, k) => s.name in colors && chart.setSeries(k + 1, { show: shown.has(s.name) }));
   }
 }
 
