@@ -25,7 +25,7 @@ from fpirhc.export import Device, Target, c_of, literal, web_module
 from fpirhc.export.c import checks_of, data_of, filled, layout_of, recorded, sources, template
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import asset
-from fpirhc.simulation.drawing import PALETTE
+from fpirhc.simulation.drawing import colours_of
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.ranges import Ranges
 from fpirhc.simulation.replay import needs_driver
@@ -171,7 +171,7 @@ def _page(task: Task, file: str, loops: list[LabLoop]) -> str:
         "cycles": problem.cycles,
         "measured": problem.measure_from,
         "worker": template("worker.js", {}),
-        "colors": [PALETTE[k % len(PALETTE)] for k in range(len(loops))],
+        "colors": [colours_of(task.controllers)[one.name] for one in loops],
         "loops": [_loop_data(loop) for loop in loops],
         "sliders": _sliders(problem, loops),
         "charts": _charts(loops),

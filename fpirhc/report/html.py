@@ -7,7 +7,6 @@ import hashlib
 import json
 import textwrap
 from collections.abc import Sequence
-from colorsys import hsv_to_rgb
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure, responses_of, shown_motion
+from fpirhc.simulation.drawing import BANDS, colours_of, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import player
 from fpirhc.studies import finite_alone
 from fpirhc.studies.verdict import IN_FULL, Outcome
@@ -89,7 +88,7 @@ def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, An
     from matplotlib import rc_context, rcsetup
 
     runs, images, motions = {e.name: e.run for e in comparison.entries if e.run.cycles > 1}, [], []
-    colours = colours_of(comparison)
+    colours = colours_of(comparison.task.controllers)
     for wanted in comparison.task.pictures:
         shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
         if not shown:
@@ -179,7 +178,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
         return {"controllers": [], "timeUnit": comparison.task.problem.time_unit, "time": [], "charts": []}
     longest = max(entries, key=lambda e: e.run.cycles).run
     edges = np.unique(np.linspace(0, longest.cycles, min(INTERVALS, longest.cycles) + 1).astype(int))
-    first, colours = entries[0].run, colours_of(comparison)
+    first, colours = entries[0].run, colours_of(comparison.task.controllers)
     names, inputs = first.layout["error"].elements, first.layout["command"].elements
     limits = {one.name: one for e in entries for one in e.limits}
     ends = {n: finite_alone(_round([one.lower, one.upper])) for n, one in limits.items()}
@@ -236,14 +235,3 @@ def _extremes(values: np.ndarray, edges: np.ndarray) -> list[float | None]:
 
 def _round(values: Sequence[float] | np.ndarray) -> list[float]:
     return [float(f"{v:.5g}") for v in np.asarray(values).tolist()]
-
-
-_GOLDEN = 0.618034  # of a turn, from hue to hue
-
-
-def colours_of(comparison: Comparison) -> dict[str, str]:
-    """Return the colour of every controller that ran, by name: that of its place in the problem file, whichever others ran."""
-    more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(comparison.task.controllers)))
-    extra = (f"#{''.join(f'{round(255 * one):02x}' for one in colour)}" for colour in more)
-    of_file = dict(zip(comparison.task.controllers, (*PALETTE, *extra), strict=False))
-    return {e.name: of_file[e.name] for e in comparison.entries if e.run.cycles > 1}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
+from colorsys import hsv_to_rgb
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
 BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
+_GOLDEN = 0.618034  # of a turn, from hue to hue
 _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
 _INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 _SHORTEST = 12  # characters of a name that was cut
@@ -143,6 +145,13 @@ def caption_axes(axis: Axes, across: str, up: str) -> None:
 def shown_motion(layout: Layout) -> str:
     """Return the name of the signal that the controller is given of what is judged: 'output' or 'state'."""
     return "output" if "output" in layout else "state"
+
+
+def colours_of(names: Collection[str]) -> dict[str, str]:
+    """Return the colour of every controller of a problem file by its place in it, whichever others run; no two have the same."""
+    more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(names)))
+    extra = (f"#{''.join(f'{round(255 * one):02x}' for one in colour)}" for colour in more)
+    return dict(zip(names, (*PALETTE, *extra), strict=False))
 
 
 def responses_of(layout: Layout) -> dict[str, str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from fpirhc.describe import as_written
 from fpirhc.studies.verdict import IN_FULL, Outcome
-from fpirhc.summary import Table, in_percent
+from fpirhc.summary import Table, in_percent, printable
 
 if TYPE_CHECKING:
     from fpirhc.controllers.base import Controller
@@ -43,7 +43,7 @@ class View:
         return ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Study(ABC):
     """The result of a study, and the circumstances in which it was made."""
 
@@ -59,6 +59,14 @@ class Study(ABC):
     @abstractmethod
     def view(self) -> View:
         """What every output says of it."""
+
+    def __repr__(self) -> str:
+        from pandas import DataFrame
+
+        view, shown = self.view, self.view.tables[0].narrow
+        rows = DataFrame([row.cells for row in shown.rows], columns=[c.head for c in shown.columns])
+        said = [self.title, *(text for text, _ in view.sentences), rows.to_string(index=False)]
+        return printable("\n".join(said))
 
     def _repr_html_(self) -> str:
         """Verdict and first table, for notebooks."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -108,12 +108,12 @@ class Entry:
         return self.metrics.rms_error
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Comparison(Study):
     """The result of `compare`."""
 
     seed: int
-    task: Task = field(repr=False)
+    task: Task
     entries: tuple[Entry, ...]
     skipped: Mapping[str, str]
 

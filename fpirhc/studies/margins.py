@@ -127,7 +127,7 @@ QUANTITIES: Mapping[str, tuple[Callable[[Problem, int], Quantity], str]] = {  # 
 }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Margins(Study):
     """The result of `margins`.
 

@@ -31,7 +31,7 @@ _CLEAR = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than", Outc
 _CLEAR[Outcome.MIXED] = "has mixed results beside"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class VariantStudy(Study):
     """The result of `study`.
 
@@ -274,7 +274,7 @@ def _commands(result: VariantStudy) -> Iterator[str]:
 
 def figure_of(result: VariantStudy) -> Any:
     """Return the picture of a study: lines or maps over the settings of a grid, else the sorted values of every controller."""
-    from fpirhc.simulation.drawing import PALETTE, draw_legend, literal, new_figure
+    from fpirhc.simulation.drawing import colours_of, draw_legend, literal, new_figure
 
     axes, table = getattr(result.variants, "axes", {}), result.table
     column, units = result.figure.column, table.attrs["units"]
@@ -299,7 +299,7 @@ def figure_of(result: VariantStudy) -> Any:
         return figure
     figure = new_figure(7, 4, f"{result.problem}: {column}")
     axis = figure.subplots()
-    colours = dict(zip(result.places, PALETTE * len(result.places), strict=False))
+    colours = colours_of(result.places)
     for name in names:
         own = shown[shown.controller == name]
         across = own[next(iter(axes))] if axes else np.linspace(0, 100, len(own))

@@ -127,7 +127,8 @@ class Draws(Variants):
                 f"all {self.count} plants would be the same: the problem has no disturbances, no noise, and nothing that is drawn; "
                 f"{mend}"
             )
-        times = {s: _with_dead_times(problem, s * self.percent) if late and s else problem for s in (-1, 0, 1)}
+        longer = lambda s: replace(problem, dead_time=problem.dead_time.longer(s * self.percent, problem.period))  # noqa: E731
+        times = {s: longer(s) if late and s else problem for s in (-1, 0, 1)}
         return _Lazy(self.count, lru_cache(4096)(partial(self._one, problem, times, wide)))
 
     def _one(self, problem: Problem, times: Mapping[int, Problem], wide: Container[str], number: int) -> Variant:
@@ -231,8 +232,3 @@ def _streams(seed: int, number: int) -> np.random.SeedSequence:
 def _told_apart(variants: Sequence[Variant]) -> list[Variant]:
     counts = Counter(one.build for one in variants)
     return [replace(one, alone=counts[one.build] == 1) for one in variants]
-
-
-def _with_dead_times(problem: Problem, percent: float) -> Problem:
-    """The problem with dead times that are longer by so many percent."""
-    return replace(problem, dead_time=problem.dead_time.longer(percent, problem.period))

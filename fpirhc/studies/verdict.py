@@ -310,10 +310,6 @@ def _not_finite(pair: Pair) -> float:
     return max((float(np.mean(status == Status.NON_FINITE)) for status in planned), default=math.nan)
 
 
-def _unsolved(entry: Entry) -> float:
-    return entry.metrics["status"][Status.NOT_CONVERGED.name] / entry.run.cycles
-
-
 def _null(pair: Pair, *, lost: bool = False) -> float:
     """How many times as large it makes the error of a right model, where the null test fails; 1 where it is `lost`."""
     null = pair.adaptive.null
@@ -341,7 +337,7 @@ _HARMS = f"with {NULL} its rms error is {{value}} times that without adaptation"
 FLAGS = (  # of rows with one measure the first that is raised
     Flag(_left_alone, 1.0, "it is no better than doing nothing: its rms error is {value:%} of that with commands held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
-    Flag(lambda pair: _unsolved(pair.adaptive), UNSOLVED,
+    Flag(lambda pair: pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles, UNSOLVED,
          "{value:%} of its plans did not converge: give the optimiser more iterations", True),
     Flag(_not_finite, UNSOLVED, "in {value:%} of cycles a plan met nan, and the last plan went on: look at roots and divisions "
          "in the response", True),

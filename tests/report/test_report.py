@@ -127,7 +127,8 @@ def test_a_page(name, tmp_path):
     for text in (said, found._repr_html_()) if found.entries else ():
         assert not re.search(r"<(b|bold)\b", text)
         assert [one for one in wanted.shows if one not in html.unescape(text)] == []
-    assert "\x1b" not in repr(found)
+    told = repr(found)
+    assert ("\x1b" in told, "at limit" in told, "Problem(" in told) == (False, bool(found.entries), False)
     charts_are_whole(found, page, wanted.ends)
     with pytest.raises(OutputError, match="cannot write the report"):
         fp.write_report(found, tmp_path / "missing" / "report.html")
