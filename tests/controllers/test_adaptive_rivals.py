@@ -269,9 +269,11 @@ def test_what_does_not_fit_is_refused_before_the_run(why):
         fp.simulate(shipped, controller, seed=0, compiled=False)
 
 
+@pytest.mark.parametrize("names", ["mbkc", "bk"])
 @pytest.mark.parametrize("late", [{"measurement": 0.01}, {"inputs": {"u": 0.01}}])
-def test_a_right_model_learns_nothing_behind_dead_time(late):
+def test_a_right_model_learns_nothing_behind_dead_time(late, names):
     """A late response belongs to the state that was measured with it and to the command that acted then."""
     right = task(rich, 0.3, believed=(1.0, 0.5, 20.0, 3.0))
-    run = fp.simulate(replace(right, dead_time=fp.DeadTime(**late)), NLMS, seed=0, compiled=False)
+    learner = replace(NLMS, bounds={name: BOX[name] for name in names})  # what is not learned is taken as it is
+    run = fp.simulate(replace(right, dead_time=fp.DeadTime(**late)), learner, seed=0, compiled=False)
     np.testing.assert_allclose(run["estimate"], run["estimate"][:1].repeat(run.cycles, axis=0), rtol=1e-12)
