@@ -28,19 +28,14 @@ LINE = line_text(
     "disturbances={'u': fp.Noise(0.1)}",
     bounds="(0.5, 2.4)",
 )
-
 CHEAP = ("accept", "check", "compare", "list", "new", "review", "run", "study", "tune")
-
 WORDS = (
     "line.py", "line.py", "line.py", "no_such.py", "broken.py", "empty.py", "two_mas", "", ".", "/", "CTC", "CTC+FPI", "CTC+FP",
     "0", "1", "2", "-1", "1e300", "nan", "inf", "0.1%", "x", "--", "-", "y", "out", "file", "\x00", "ü", "a" * 300, "=", "a=b",
     "deformation.gain=-0.4", "tracking.rate=nan", "rms error", "*", "../..", "~", "bash", "csh",
 )  # fmt: skip
-
 FLAGS = ("--help", "--debug", "--no-such-option", "-x", "--out", "--draws", "--processes", "--seed", "--no-compile")
-
 SLOW = ("--trials", "--draws", "--seeds", "--processes", "--cycles")  # options with a number that is kept small
-
 CODES = {0, 1, 2, 3, 4, 5, 6}
 
 

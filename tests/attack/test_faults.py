@@ -14,7 +14,6 @@ from fpirhc.contracts import Controller, values_of
 from fpirhc.errors import FpirhcError
 
 Array = np.ndarray
-
 FIRST, BEGIN = 0, 30  # cycles in which faults begin
 
 
@@ -93,7 +92,6 @@ SINGLE = (
     Fault("clock is NaN", _clock(lambda _: np.nan), single=True),
     Fault("state overflows, 1e301", _set("state", 1e301), single=True),
 )
-
 LASTING = (
     Fault("response spikes, 1e9", _set("realised", 1e9)),
     Fault("response spikes, 1e155", _set("realised", 1e155)),
@@ -117,20 +115,15 @@ LASTING = (
     Fault("actuator of the opposite sign", actuator=lambda u, low, high: -u, length=15),
     Fault("parameter jumps", heavier=1.3, length=10**6),
 )
-
 _EARLY = (*SINGLE, *(f for f in LASTING if "spikes" in f.name))
-
 AT_START = tuple(replace(f, name=f"at the start, {f.name}", first=FIRST, length=3, single=False) for f in _EARLY)
-
 FAULTS = (*SINGLE, *LASTING, *AT_START)
 
 
 # A stepper and its plant are driven through a fault
 
 _GONE = 1e12  # size of a state that no plant comes back from
-
 CYCLES, LATE = 80, 15  # cycles of a run, and of its end, in which a controller must act again
-
 SKIPPING = {Status.BAD_SAMPLE, Status.NON_FINITE, Status.SOLVER_FAILED, Status.RESTARTED}
 
 

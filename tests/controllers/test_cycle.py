@@ -13,9 +13,7 @@ import fpirhc as fp
 from fpirhc.errors import InvalidValue
 
 PERIOD, RATE = 0.05, 2.0
-
 EXACT, BELIEVED, LOAD = np.array([2.0, 4.0]), np.array([1.0, 8.0]), np.array([0.0, 3.0])
-
 LIMITS = {"u": (-4.0, 5.0), "w": (-1.0, np.inf)}
 
 
@@ -148,7 +146,6 @@ PLANNED = {
     "cost": fp.Quadratic(states={"a": 9.0, "b": 9.0}, effort={"u": 0.1, "w": 0.1}),
     "duration": 0.5,
 }
-
 PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=4, tolerance=1e-6), fp.Sigmoid(gain=-0.5))
 
 
@@ -193,7 +190,6 @@ def test_a_plan_without_limits_needs_a_scale():
 # Limits of rates are kept in the command of every controller, as limits of inputs are
 
 FASTEST = 20.0  # N/s
-
 PROBLEM = fp.Problem(
     plant=fp.Plant(
         coordinates={"x": "m"},
@@ -211,7 +207,6 @@ PROBLEM = fp.Problem(
     horizon=fp.Horizon(stages=20, step=0.05),
     cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, rate={"F": 1e-3}),
 )
-
 CONTROLLERS = {
     "RHC": fp.RecedingHorizon(fp.FixedPointSolver()),
     "RHC+FPI": fp.RecedingHorizon(fp.FixedPointSolver(), fp.ModelReferenced(fp.Affine(gain=-0.8))),

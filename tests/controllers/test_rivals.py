@@ -13,9 +13,7 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem
 
 RATE = 6.0
-
 TRACK = fp.Exponential(rate=RATE)
-
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=10.0)
 LOAD = {"y": fp.Step(at=0.3, size=-2.0)}
 

@@ -31,9 +31,7 @@ def short(problem: fp.Problem, **changes) -> fp.Problem:
 
 
 two_mass = cache(lambda: short(tasks.two_mass.problem))
-
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=2.0)
-
 LAW = fp.Exponential(rate=6.0)
 
 

@@ -134,7 +134,6 @@ def test_facts_of_the_rotation():
 # Laws
 
 MAPS = examples("deformations", fp.Affine(gain=-0.5))
-
 ITERATING = tuple(m for m in MAPS if m.effective_gain() != 0)
 
 

@@ -144,9 +144,7 @@ ESTIMATORS = (
     fp.SavitzkyGolay(window=5, degree=2),
     fp.SavitzkyGolay(window=9, degree=3),
 )
-
 QUANTA = {"q1": fp.Sensor(quantum=1e-5), "q2": fp.Sensor(quantum=3e-5)}
-
 WAITS = (
     {},
     {"dead_time": fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3})},

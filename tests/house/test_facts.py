@@ -14,11 +14,8 @@ from fpirhc.errors import InvalidField, NotSupported
 
 TRACK = fp.Exponential(rate=6.0)
 LAW = fp.ComputedTorque(TRACK)
-
 PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3))
-
 LIMITS = fp.Limits(inputs={"u": (-20.0, 20.0)})
-
 LOOKING_AHEAD = {
     "horizon": fp.Horizon(stages=10, step=1e-2),
     "cost": fp.Quadratic(states={"q": 1e3, "q'": 1.0}, deviation={"u": 1e-3}),
@@ -26,7 +23,6 @@ LOOKING_AHEAD = {
     "duration": 0.2,
     "start": {"q": 0.05},
 }
-
 FILTER = fp.DisturbanceKalman(drift={"q": 1e-3}, measured={"q": 1e-4, "q'": 1e-4}, noise={"q": 1e-3})
 
 

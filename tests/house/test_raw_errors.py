@@ -15,9 +15,7 @@ from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, NotSupporte
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
 NAME = "CTC+FPI (eq 6)"
-
 adaptive = cache(lambda: tasks.two_mass.controllers[NAME])
-
 HUGE = 10**400  # a whole number that is no float
 
 

@@ -45,9 +45,7 @@ def task(plant: fp.Plant, **changes) -> fp.Problem:
 
 
 RHC = fp.RecedingHorizon(fp.FixedPointSolver(iterations=2, tolerance=1e-6))
-
 SPRING = {"k": fp.Uncertain(0.0, 10.0, 1.0), "b": fp.Uncertain(0.1, 5.0, 0.5)}
-
 NOISE = {"y": 0.1}
 
 
@@ -182,7 +180,6 @@ def test_estimators_that_do_not_fit_are_refused(problem, estimator, error, messa
 
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=2.0))
-
 LATE = {
     "input": fp.DeadTime(inputs={"u": 0.05}),
     "measurement": fp.DeadTime(measurement=0.05),

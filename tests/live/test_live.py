@@ -20,13 +20,9 @@ from fpirhc.errors import (
 )
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.3, measure_from=0.0))
-
 by_torque = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
-
 by_plan = cache(lambda: tasks.two_mass.controllers["RHC+FPI"])
-
 FOUR = ["tracking.rate", "deformation.gain", "deformation.scale", "deformation.shift"]
-
 FIVE = ["deformation.gain", "cost.states.q1", "cost.states.q2'", "cost.deviation.Q1", "limits.inputs.Q1.1"]
 
 
@@ -86,9 +82,7 @@ aimed = cache(
         tasks.two_mass.problem, reference=fp.Setpoint({"q1": 0.1, "q2": 0.2}, rate=3.0), duration=0.02, measure_from=0.0
     )
 )
-
 HUGE = 10**400  # a whole number that is no float
-
 GAIN, TOP = "deformation.gain", "limits.inputs.Q1.1"
 
 
@@ -229,7 +223,6 @@ def test_what_cannot_be_live_is_refused_by_name(name, path, error, words):
 # A gain beyond the limit of its iteration is refused, built in or given while the loop runs, unless it is asked for
 
 LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
-
 LARGEST = 4 / 1.5  # of an affine map: |1 - a lambda| < 1 with a half of its gain, lambda = 1.5 and 1.3
 
 

@@ -16,10 +16,8 @@ from fpirhc.contracts import Tracking
 from fpirhc.errors import FpirhcError
 
 T = 10.0  # s, one step
-
 RATE = 0.04  # 1/s
 REFERENCED = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.ModelReferenced(fp.Affine(gain=-1.0)))
-
 FISH = {
     "growth": fp.Parameter(approximate=0.02, exact=0.03, unit="1/s"),
     "caught": fp.Parameter(approximate=1.0, exact=0.7, unit="1"),

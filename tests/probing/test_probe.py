@@ -15,7 +15,6 @@ import fpirhc as fp
 from fpirhc.contracts import Deformation
 
 PERIOD = 1e-2
-
 RHC = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-2))
 
 
@@ -96,7 +95,6 @@ KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (0.6, 0, 0.05, 0.05),
     (1.5, 2, 0.03, 0.3),
 ]
-
 NAMES = ("q", "p"), ("u", "w")
 
 

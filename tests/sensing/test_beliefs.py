@@ -162,9 +162,7 @@ def test_a_filter_of_a_map_is_that_of_the_books() -> None:
 
 
 PLAIN = fp.ComputedTorque(fp.Exponential(rate=1.0))
-
 E0, STEEP = 93.0, 1.4
-
 DEPTH = fp.KalmanFilter(
     measured={"depth": 0.3}, noise={"C": 0.05, "E": 0.05, "R": 0.02}, start={"C": 0.2, "E": 0.2, "R": 0.1}
 )

@@ -23,9 +23,7 @@ ESTIMATORS = (
     fp.SavitzkyGolay(window=7, degree=4),
     fp.SavitzkyGolay(window=11, degree=5),
 )
-
 NOISE = fp.Sensor(noise=fp.Noise(1.0))
-
 GENTLE = fp.Exponential(rate=0.01, integral=False)
 
 

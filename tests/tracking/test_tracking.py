@@ -55,7 +55,6 @@ def test_closed_loop_follows_mittag_leffler(order, beta, after):
 
 
 LARGEST = (0.05,)  # m/s^n: what limits are said to allow
-
 LAWS = (  # with (g_0, g_1) for order 1 and for order 2
     (fp.Exponential(2.0, bumpless=False, largest=LARGEST), (4, 4), (8, 12)),
     (fp.ShiftPolynomial(0.98, step=0.01, largest=LARGEST), (4, 4), (8, 12)),
