@@ -8,9 +8,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
+from helpers.plants import simulated
 
 import fpirhc as fp
 
@@ -22,23 +22,6 @@ TOTAL_TIME_SPENT = 1433.7876921  # veh h
 @cache
 def task(name: str) -> Any:
     return fp.load_problem(name)
-
-
-@cache
-def run_of(name: str, controller: str) -> fp.Run:
-    """One run of a shipped task."""
-    return fp.simulate(task(name).problem, task(name).controllers[controller], seed=0, compiled=False)
-
-
-def error(name: str, controller: str) -> float:
-    [value] = fp.measure(task(name).problem, run_of(name, controller)).rms_error.values()
-    return float(value)
-
-
-def stepper(plant: fp.Plant) -> ca.Function:
-    """One step of 10 s, (state, inputs, parameters) -> state, and not the six of a minute."""
-    x, u, p = replace(plant, steps=1).symbols()
-    return ca.Function("step", [x, u, p], [plant.equations.next(x, u, p, ca.SX.zeros(len(plant.names)))])
 
 
 def with_demands(plant: fp.Plant, steps: int) -> np.ndarray:
@@ -56,19 +39,16 @@ def with_demands(plant: fp.Plant, steps: int) -> np.ndarray:
 def driven(name: str, commands: np.ndarray) -> np.ndarray:
     """States after each step of 10 s under these commands (steps, nu), from the start of a task."""
     problem = task(name).problem
-    plant = replace(problem.plant, steps=1)
-    run = stepper(plant).mapaccum(len(commands))
-    return np.asarray(run(problem.start_state, commands.T, with_demands(plant, len(commands)).T).full()).T
-
-
-def open_loop() -> np.ndarray:
-    """900 steps of 10 s with an open ramp and the demands of the source, shape (900, 14)."""
-    return driven("freeway_metering", np.ones((900, 1)))
+    plant = replace(problem.plant, steps=1)  # of 10 s, and not the six of a minute
+    run = plant.equations.next.mapaccum(len(commands))
+    still = np.zeros((len(plant.names), 1))
+    return np.asarray(run(problem.start_state, commands.T, with_demands(plant, len(commands)).T, still).full()).T
 
 
 def test_metanet_is_the_published_run() -> None:
     """Densities, speeds and queues to rounding, and the total time spent to every printed digit."""
-    states, rows = open_loop(), np.loadtxt(DATA, delimiter=",", skiprows=1)
+    rows = np.loadtxt(DATA, delimiter=",", skiprows=1)
+    states = driven("freeway_metering", np.ones((900, 1)))  # with an open ramp
     at, published = rows[:, 0].astype(int), rows[:, 1:]
     assert len(at) == 45
     np.testing.assert_allclose(states[at], published, rtol=1e-14, atol=2e-13)
@@ -81,7 +61,9 @@ def test_metanet_is_the_published_run() -> None:
 
 def test_an_exact_map_of_a_minute_has_no_error() -> None:
     """Six steps with the rate held are one map, whose inverse the controller has."""
-    assert error("freeway_metering", "CTC exact model") < 1e-12
+    shipped = task("freeway_metering")
+    run = simulated(shipped.problem, shipped.controllers["CTC exact model"])
+    assert max(fp.measure(shipped.problem, run).rms_error.values()) < 1e-12
 
 
 # The time spent
@@ -107,23 +89,12 @@ def test_an_economic_plan_is_the_published_run(which: str) -> None:
     assert run["plant_state.spent"][16] == pytest.approx(96.813, abs=0.011)
 
 
-PUBLISHED_SIGNS = DATA.with_name("coordinated.csv")  # minute, rate, two signs
-
-
-def published_signs() -> np.ndarray:
-    """Rate and signs of 17 minutes of the source's coordinated run, shape (17, 3)."""
-    return np.loadtxt(PUBLISHED_SIGNS, delimiter=",", skiprows=1)[:, 1:]
-
-
-def spent_in(commands: np.ndarray) -> np.ndarray:
-    """Time spent after each step under commands by minute, veh h."""
-    plant = task("freeway_coordinated").problem.plant
-    return driven("freeway_coordinated", np.repeat(commands, 6, axis=0))[:, plant.state.elements.index("spent")]
-
-
 def test_published_signs_and_rates_spend_the_published_time() -> None:
     """The map with its minimum, under the 100 steps of the source's coordinated run: 102.07711241922753 veh h."""
-    assert spent_in(published_signs())[99] == pytest.approx(102.07711241922753, abs=1e-9)
+    commands = np.loadtxt(DATA.with_name("coordinated.csv"), delimiter=",", skiprows=1)[:, 1:]  # of 17 minutes
+    states = driven("freeway_coordinated", np.repeat(commands, 6, axis=0))
+    spent = task("freeway_coordinated").problem.plant.state.elements.index("spent")
+    assert states[99, spent] == pytest.approx(102.07711241922753, abs=1e-9)
 
 
 # Emission
