@@ -1,6 +1,7 @@
 """Small plants of which a review is asked, and the answers about a mass whose model is too heavy, by their keys."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -178,3 +179,40 @@ def tank() -> fp.Problem:
         **{"dead_time": fp.DeadTime(inputs={"pump": 1.5}), "horizon": fp.Horizon(stages=20, step=1.0)},
         cost=fp.Quadratic(states={"h": 1e4}, deviation={"pump": 1e-2}),
     )
+
+
+def motor(stronger: float = 2.86, **settings: Any) -> fp.Problem:
+    """A motor whose plant answers so many times as strongly as its model."""
+    gain = fp.Parameter(3.5, 3.5 * stronger, "rad/s^2/V")
+    plant = fp.Plant({"q": "rad"}, {"V": "V"}, {"gain": gain}, lambda q, v, u, p: {"q": p.gain * u.V - 2 * v.q})
+    usual: dict[str, Any] = {"period": 2e-3, "duration": 4.0, "measure_from": 1.0}
+    usual |= {"limits": fp.Limits(inputs={"V": (-12.0, 12.0)}), "start": {"q": 0.0, "q'": 2.0}}
+    return fp.Problem(plant, fp.Trajectory(lambda t: {"q": ca.sin(2 * t)}), **(usual | settings))
+
+
+def law(gain: float, rate: float = 8.0) -> fp.ComputedTorque:
+    return fp.ComputedTorque(fp.Exponential(rate), fp.ModelReferenced(fp.Sigmoid(gain)))
+
+
+def behind_an_actuator(lag: float) -> fp.Problem:
+    """A motor on whose actuator the model's torque acts at once."""
+    response = lambda q, v, u, p: {"q": 5.6 * q.act - 4 * v.q, "act": (u.V - q.act) / lag}  # noqa: E731
+    real = fp.Plant({"q": "rad", "act": "V"}, {"V": "V"}, {}, response, order={"q": 2, "act": 1})
+    return motor(1.0, period=5e-3, duration=6.0, reality=fp.Reality(real, start={"act": 0.0}))
+
+
+NOISY = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(3e-5))}, fp.SavitzkyGolay(window=21, degree=2))
+
+
+def heated(limits: fp.Limits, swing: float = 1.0) -> fp.Problem:
+    """A room that needs 0.9 to 3.7 K/s, or with another swing more."""
+    wave = fp.Trajectory(lambda t: {"T": 2 + swing * ca.sin(0.5 * t)})
+    return replace(heater(), reference=wave, start={"T": 2.0}, duration=20.0, measure_from=3.0, limits=limits)
+
+
+def pushed_away(force: float, **settings: Any) -> fp.Problem:
+    """A mass that a spring pushes away, which at most this force holds."""
+    known = {name: fp.Parameter(value, value, "1") for name, value in (("k", 4.0), ("b", 1.0))}
+    plant = fp.Plant({"q": "m"}, {"u": "N"}, known, lambda q, v, u, p: {"q": p.k * q.q + p.b * u.u})
+    wave, ends = fp.Trajectory(lambda t: {"q": 0.05 * ca.sin(t)}), fp.Limits(inputs={"u": (-force, force)})
+    return fp.Problem(plant, wave, {"q": 0.0, "q'": 0.05}, period=1e-2, duration=10.0, limits=ends, **settings)

@@ -5,7 +5,9 @@ Truths are closed forms or runs by `fpirhc.simulate` of another start, gain or m
 """
 
 import json
+import math
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -18,7 +20,22 @@ import pytest
 from abroad import load
 from helpers import reviewed
 from helpers.kinds import slow_but
-from helpers.reviewed import ball, biased, plans, turntable
+from helpers.reviewed import (
+    NOISY,
+    answers,
+    ball,
+    behind_an_actuator,
+    biased,
+    heated,
+    heater,
+    law,
+    mass,
+    motor,
+    plans,
+    pushed_away,
+    torque,
+    turntable,
+)
 
 import fpirhc as fp
 
@@ -39,6 +56,18 @@ class Case:
     numbers: dict[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)  # value, its tolerance
     never: tuple[str, ...] = ()  # about whom there is no no
     changes: dict[tuple[str, str], str] = field(default_factory=dict)
+    told: dict[tuple[str, str], str] = field(default_factory=dict)  # how the evidence begins
+    mismatch: float = 0.0
+
+
+def of(task: Callable[[], tuple[fp.Problem, Any]], *rows: str, mismatch: float = 0.0) -> Case:
+    """A case of one controller: (key, advice) and (key, how the evidence begins), each 'key: words' or 'key = words'."""
+    both: dict[str, dict[tuple[str, str], str]] = {": ": {}, " = ": {}}
+    for row in rows:
+        sign = ": " if ": " in row.partition(" ")[0] + " " else " = "
+        key, _, words = row.partition(sign)
+        both[sign]["problem" if key in ("sizes", "inside") else "it", key] = words
+    return Case(lambda: ((made := task())[0], {"it": made[1]}), changes=both[": "], told=both[" = "], mismatch=mismatch)
 
 
 def shipped(name: str, *controllers: str, of: Callable[[str], Any] = fp.load_problem) -> Pick:
@@ -59,6 +88,52 @@ PLANT = fp.Plant({"q": "rad", "load": "rad"}, {"u": "rad/s^2"}, {}, LOADED, cont
 SINES = fp.Trajectory(lambda t: {"q": ca.sin(t), "load": ca.sin(t)})
 SWINGING = fp.Problem(PLANT, SINES, {"q": 0.0, "load": 0.0}, period=2e-3, duration=4.0)
 SERVO = -1.0, -1.97, -2.12
+DERIVED = fp.SavitzkyGolay(15, 2)
+KILO = "Divide the reference by 1 000: is it a slip of units?"
+LESS = "Set the noise of q to 0.005 m: is it a slip of units?"
+OWN = {
+    "a gain that is refused": lambda: (motor(), law(-9.0)),
+    "a gain that is too small": lambda: (motor(1.2), law(0.01)),
+    "a gain of the wrong sign behind a noisy encoder": lambda: (motor(0.7, sensing=NOISY), law(2.0)),
+    "a gain that is too large": lambda: (mass(), torque(-20.0)),
+    "a gain of the wrong sign behind a prediction": lambda: (
+        motor(0.7, dead_time=fp.DeadTime({"V": 0.01})),
+        fp.Predicted(law(1.0), inputs=0.01),
+    ),
+}
+
+
+LONG_RUNS = {  # and how many seconds of them are run
+    "a run of more than 4000 cycles": (lambda: mass(duration=5.0), 4.0),
+    "errors that count late in a long run": (lambda: mass(duration=9.0, measure_from=3.0), 5.0),
+}
+
+
+def within(ends: tuple[float, float], rates: dict[str, Any] | None = None) -> fp.Problem:
+    return heated(fp.Limits({"u": ends}, rates=rates or {}), 1.0 if rates else 1.6)
+
+
+def follower(rate: float, **more: Any) -> fp.ComputedTorque:
+    return fp.ComputedTorque(fp.Exponential(rate, **more))
+
+
+def units(**fields: Any) -> tuple[fp.Problem, Any]:
+    return mass(**fields, limits=fp.Limits(inputs={"u": (-20.0, 20.0)})), follower(6.0)
+
+
+def seen(limit: float, noise: float, own: Any) -> tuple[fp.Problem, Any]:
+    """A right model behind a noisy encoder."""
+    sensing = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(noise))}, own)
+    return motor(1.0, sensing=sensing, limits=fp.Limits({"V": (-limit, limit)})), follower(8.0)
+
+
+def stiff(force: float) -> fp.Problem:
+    """The spring of the model pulls with 6 N/m."""
+    one = pushed_away(force)
+    known = {**one.plant.parameters, "k": fp.Parameter(6.0, 4.0, "1")}
+    return replace(one, plant=replace(one.plant, parameters=known))
+
+
 CTC6, PAIRED = "CTC+FPI (eq 6)", "CTC+FPI paired"
 CASES: dict[str, Case] = {
     "a room that comes back with the time constant of its loss": Case(
@@ -183,14 +258,84 @@ CASES: dict[str, Case] = {
         {("Cascade, last target", "model", "error_with"): (0.135, 1e-3)},
         never=("Cascade, last target",),
     ),
-}
+    **{name: of(task) for name, task in OWN.items()},
+    "an actuator that the model lacks": of(lambda: (behind_an_actuator(0.4), law(-1.5, 3.0))),
+    "an encoder that moves the command": of(lambda: seen(12, 2e-4, fp.SavitzkyGolay(5, 2)),
+        "noise: Take the estimator SavitzkyGolay(window=41, degree=2). The error is then 6.3 times as large."),
+    "an encoder that moves the command to its limits": of(lambda: seen(1.75, 1e-3, fp.PositionDifference()),
+        "input_limits: Take the estimator SavitzkyGolay(window=31, degree=2)."),
+    "what passes at twice the error": of(lambda: (
+        replace(biased(0.0), duration=4.0, sensing=fp.Sensing(
+            {"x": fp.Sensor(noise=fp.Noise(9e-3)), "x'": fp.Sensor(noise=fp.Noise(6e-2))})), plans(iterations=3)["RHC"]),
+        'noise: Weigh the changes of the inputs: Quadratic(..., rate={"F": 1.0}). The error is then 1.84 times as large.'),
+    "rates of an input that are far too low": of(
+        lambda: (within((-9.0, 9.0), {"u": (-0.2, 0.2)}), replace(follower(3.0), deformation=fp.ModelReferenced(fp.Affine(-0.5)))),
+        "input_limits: Slow the reference to a quarter of its speed. It helps, but the answer is then caution.",
+    ),
+    **{
+        f"limits of {low} and {high}": of(
+            lambda ends=(low, high): (within(ends), follower(3.0)),
+            f'input_limits: Widen the limits of the inputs: Limits(inputs={{"u": ({wider})}}).',
+        )
+        for low, high, wider in (
+            (0.0, 2.0, "0.0, 4.9"), (1.8, 12.0, "0.0, 12.0"), (-4.0, 1.5, "-4.0, 4.9"), (2.0, math.inf, "0.0, math.inf"),
+            (0.0, 0.8, "0.0, 4.9"),
+        )
+    },
+    "a reference that begins in millimetres": of(
+        lambda: units(reference=fp.Trajectory(lambda t: {"q": 500 * ca.cos(t)}), start={"q": 0.5}),
+        "sizes = The reference of q begins at", f"sizes: {KILO}", f"follows: {KILO}",
+    ),
+    "a reference in millimetres": of(
+        lambda: units(reference=fp.Trajectory(lambda t: {"q": 500 * ca.sin(t)})),
+        "sizes = The reference needs 112 times the limits of u.", f"sizes: {KILO}", f"follows: {KILO}",
+    ),
+    "noise in millimetres": of(
+        lambda: units(sensing=fp.Sensing({"q": fp.Sensor(fp.Noise(5.0))}, DERIVED)),
+        "sizes = The noise of q is 5 m, and its", f"sizes: {LESS}",
+    ),
+    "noise in micrometres": of(
+        lambda: units(sensing=fp.Sensing({"q": fp.Sensor(fp.Noise(5e3))}, DERIVED)),
+        "sizes = The noise of q is 5 000 m, and its", f"sizes: {LESS}",
+    ),
+    "an angle in degrees": of(
+        lambda: units(plant=replace(mass().plant, coordinates={"q": "rad"}),
+                      reference=fp.Trajectory(lambda t: {"q": 50 * ca.sin(t)})),
+        "sizes = The reference needs 11.2 times the limits of u.", "sizes: Divide the reference by 57.3: is it a slip of units?",
+    ),
+    "a late command that swings with more gain and falls with less": of(
+        lambda: (pushed_away(1e3, dead_time=fp.DeadTime({"u": 0.31})), follower(1.2, integral=False)),
+        "input_gain = With 0.7 and 1.4", mismatch=40.0,
+    ),
+    "a little force that holds no other plant": of(
+        lambda: (pushed_away(0.252, dead_time=fp.DeadTime({"u": 0.17})), follower(3.0, integral=False)),
+        "box = It is lost on 4 of 4 trial plants: one with k 40 % larger, b 40 % larger; one with k 40 % larger, b 40 % smaller; "
+        "one with k 40 % smaller, b 40 % smaller; one with k 40 % smaller, b 40 % larger", mismatch=40.0,
+    ),
+    "a spring of the model that pulls with more than the largest force": of(
+        lambda: (stiff(0.28), follower(3.0)), "box = It is lost on 1 of 2 trial plants: the model itself, "),
+    "that spring among plants of the box": of(
+        lambda: (stiff(0.28), follower(3.0)), "box = It is lost on 1 of 6 trial plants: the model itself, ", mismatch=5.0),
+    "a gain that mends another row than its own": of(lambda: (
+        mass(period=5e-3, sensing=fp.Sensing({"q''": fp.Sensor(fp.Noise(0.3))}), dead_time=fp.DeadTime({"u": 0.01}),
+             measure_from=2.0), torque(-0.1)), "model: Set deformation.gain to -0.2."),
+    **{name: of(lambda make=make: (make(), torque())) for name, (make, _) in LONG_RUNS.items()},
+    "too much noise": of(
+        lambda: seen(12, 0.02, fp.SavitzkyGolay(15, 2)),
+        "noise: Measure the response with less noise. None of the changes that were run helps, 8 in all: estimator, rate "
+        "(estimator window 7, window 31, window 61, window 121; rate 4, 16, 2, 32).",
+    ),
+    "a level that is held once": of(lambda: (
+        replace(heater(), reference=fp.Trajectory(lambda t: {"T": 1.0 + 0 * t}), start={"T": 0.9}, limits=fp.Limits()),
+        replace(follower(3.0, integral=False), deformation=fp.ModelReferenced(fp.Affine(-0.5))))),
+}  # fmt: skip
 
 
 @cache
 def said(name: str) -> dict[tuple[str, str], Any]:
     """All answers of a case, by whom they are about and their key."""
     problem, controllers = CASES[name].task()
-    found = fp.review(problem, controllers, mismatch=0.0, seed=0).answers
+    found = fp.review(problem, controllers, mismatch=CASES[name].mismatch, seed=0).answers
     return {(about, a.key): a for about, some in found.items() for a in some}
 
 
@@ -215,12 +360,13 @@ def test_what_is_said_is_true(name):
     assert {k: [*row[:2], {*row[2]}] for k, row in rows.items()} == {k: [*r[:2], {*r[2]}] for k, r in before.items()}
     for key, (verdict, _, numbers) in rows.items():
         was = before[key][2] if verdict in ("yes", "caution") else numbers
-        assert numbers == pytest.approx(was, rel=0.02, abs=1e-6, nan_ok=True), key
+        assert numbers == pytest.approx(was, rel=5e-4, abs=1e-6, nan_ok=True), key
     assert {key: found[key].verdict.value for key in case.verdicts} == case.verdicts
     assert not [(k, a) for k, a in found.items() if k[0] in case.never and a.verdict == "no"]
     for (about, key, number), (value, tolerance) in case.numbers.items():
         assert found[about, key].numbers[number] == pytest.approx(value, abs=tolerance), (about, key, number)
     assert {key: found[key].change for key in case.changes} == case.changes
+    assert {key: found[key].evidence[: len(words)] for key, words in case.told.items()} == case.told
     grows = [a for a in found.values() if "most_left" in a.numbers and a.numbers["left"] <= 0.5]
     assert all("of one ten times as large " in a.evidence for a in grows)
     good = {k: a for k, a in found.items() if a.verdict == "yes"}
@@ -230,6 +376,28 @@ def test_what_is_said_is_true(name):
 
 
 # Own runs beside the answers
+
+
+@pytest.mark.parametrize("name", LONG_RUNS)
+def test_of_a_long_run_4000_cycles_are_run_or_2000_in_which_errors_count(name):
+    make, lasts = LONG_RUNS[name]
+    problem = replace(make(), duration=lasts)
+    run = fp.simulate(problem, torque(), seed=0, compiled=False)
+    assert said(name)["it", "follows"].numbers["rms_error"] == pytest.approx(
+        fp.measure(problem, run).rms_error["q"], rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_recommended_gain_is_admitted_helps_and_asks_for_no_other(name):
+    """Refused, too small, too large, and two of the wrong sign, one with a noisy encoder; set by the path that is named."""
+    (problem, own), told = OWN[name](), said(name)["it", "gain"]
+    [path] = re.findall(r"^Set (\S+) to -\S+\.", told.change)
+    new = fp.with_settings(own, {path: told.numbers["recommended_gain"]})
+    run, alone = (fp.simulate(problem, c, seed=0, compiled=False) for c in (new, new.with_deformation(fp.Identity())))
+    assert fp.measure(problem, run).rms_error["q"] < fp.measure(problem, alone).rms_error["q"]  # and none is refused
+    then = answers(problem, new)["gain"]
+    assert (then.verdict, then.change, then.numbers["recommended_times"]) == ("yes", "", 1)
 
 
 def test_a_plant_outside_is_asked_by_its_model():
