@@ -90,18 +90,15 @@ PAGES = {
             r"deformation=fp.Sigmoid\(gain=-0.5, scale=5.0\)",
             "<pre class='about'>y = 2 x</pre><p class='about'>Its task.</p>",
             "<img[^>]*good: adaptive", "bad is not drawn",
-        ],
-    ),
+        ]),
     "part": Page(partial(compared, "exact", "adaptive"), lacks=["Pictures of this problem"]),
     # A limited state that nobody judges has a chart; a price is no limit, and an error and a free input have none.
     "limited": Page(
         partial(compared, "plain", limits=ENDS),
-        ends={"y": ("m", []), "command u": ("N", [-20.0, None]), "y'": ("m/s", [-4.0, 5.0])},
-    ),
+        ends={"y": ("m", []), "command u": ("N", [-20.0, None]), "y'": ("m/s", [-4.0, 5.0])}),
     "left": Page(
         partial(compared, "plain", limits=fp.Limits(states={"y'": (-1.0, 1.0)})),
-        ["<tr class='red'><th scope='row'>plain</th>", "class='outcome-leaves-a-limit'>plain leaves a limit: y&#39; reach"],
-    ),
+        ["<tr class='red'><th scope='row'>plain</th>", "class='outcome-leaves-a-limit'>plain leaves a limit: y&#39; reach"]),
     "ended": Page(ended, ["does not finish: signal &#39;x&#39; is not finite", "<td class='none'>none</td>"]),
     "empty": Page(lambda: replace(compared("plain"), entries=(), skipped={"x": "because"}), ["No controller finished"]),
     "days": Page(daily, [r"\[day\]"], [SECONDS]),

@@ -84,9 +84,7 @@ def test_a_slip_of_units_is_named_where_a_controller_does_not_fit_and_where_it_i
     light = fp.Plant({"q": "m"}, {"u": "N"}, known, falls)
     problem = mass(plant=light, horizon=fp.Horizon(20, 0.02), cost=fp.Quadratic({"q": 1e2}, deviation={"u": 1e-2}))
     mend = "Mend m of the model: is it a slip of units?"
-    [fits] = answers(
-        problem, fp.RecedingHorizon(fp.FixedPointSolver())
-    ).values()  # that it does not fit is all that is said
+    [fits] = answers(problem, fp.RecedingHorizon(fp.FixedPointSolver())).values()  # it is all that is said
     assert (fits.key, fits.verdict, fits.change.startswith(f"{mend} FixedPointSolver")) == ("fits", "no", True)
     first, *others = (a for a in answers(problem).values() if a.change)
     assert (first.evidence, {a.change for a in others}) == ("In the model m is 0.001 times the plant's.", {mend})
@@ -96,22 +94,15 @@ def test_a_response_without_a_value_on_the_reference_is_named_with_its_place():
     plant = replace(heater().plant, response=lambda x, u, p: {"T": u.u - ca.sqrt(0.5 - x.T)})
     plan = {"horizon": fp.Horizon(5, 0.1), "cost": fp.Quadratic({"T": 1.0}, deviation={"u": 1.0}, rate={"u": 1.0})}
     [fits] = answers(replace(heater(), plant=plant, start={"T": 0.2}, **plan), plans()["RHC"]).values()
-    assert (
-        "T = 1: no command gives the response that is needed; look at signs, roots and divisions in test_adv"
-        in fits.change
-    )
+    told = "T = 1: no command gives the response that is needed; look at signs, roots and divisions in test_adv"
+    assert told in fits.change
 
 
 def test_a_forgotten_estimator_is_told():
     """Not where there is one, where a derivative has a sensor, or of a bias, which is in no derivative."""
-    noisy, biased = {"q": fp.Sensor(fp.Noise(1e-4))}, {"q": fp.Sensor(fp.Step(0.0, 1e-4))}
-    seen = (
-        fp.Sensing(noisy),
-        fp.Sensing({"q": fp.Sensor(quantum=1e-4)}),
-        fp.Sensing(noisy, NOISY.estimator),
-        fp.Sensing(noisy | {"q'": fp.Sensor()}),
-        fp.Sensing(biased),
-    )
+    noisy, other = fp.Sensor(fp.Noise(1e-4)), (fp.Sensor(quantum=1e-4), fp.Sensor(fp.Step(0.0, 1e-4)))
+    seen = [fp.Sensing({"q": one}) for one in (noisy, *other)]
+    seen[2:2] = fp.Sensing({"q": noisy}, NOISY.estimator), fp.Sensing({"q": noisy, "q'": fp.Sensor()})
     found = [answers(motor(0.7, sensing=one, duration=1.5), law(1.0)).get("noiseless") for one in seen]
     assert [told and (told.verdict, told.of) for told in found] == [("caution", "q', q''")] * 2 + [None] * 3
 

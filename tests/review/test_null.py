@@ -13,6 +13,7 @@ from fpirhc.contracts import Controller, Deformation
 
 POLE = 86.7  # 1/s
 MAP = fp.Affine(gain=-1.0)
+LAG = 0.02  # s
 
 
 def drifting(*, exact: float = POLE) -> fp.Problem:
@@ -95,3 +96,29 @@ def test_harm_is_a_no_however_small_the_errors_are():
         ratios.append(np.divide(*(fp.measure(problem, run).rms_error["q"] for run in runs)))
         assert (reviewed.answers(problem, own)["pays"].verdict == "no") == (ratios[-1] > 1.2), (seed, ratios)
     assert sum(ratio > 1.2 for ratio in ratios) == 2
+
+
+def lagging() -> fp.Reality:
+    """A mass on a spring behind an actuator: tau du/dt = u_c - u."""
+    known, order = {"m": fp.Parameter(1.5, 1.0, "kg")}, {"q": 2, "acting": 1}
+    moves = lambda q, v, u, p: {"q": (q.acting - 10 * q.q) / p.m, "acting": (u.u - q.acting) / LAG}  # noqa: E731
+    behind = fp.Plant({"q": "m", "acting": "N"}, {"u": "N"}, known, moves, order=order)
+    return fp.Reality(behind, start={"q": 0.0, "q'": 1.5, "acting": 0.0})
+
+
+def believed(reality: fp.Reality | None, form: Deformation) -> Any:
+    law = fp.ComputedTorque(fp.Exponential(rate=6.0), form)
+    return alone(reviewed.mass(measure_from=1.0, reality=reality), law)
+
+
+@pytest.mark.parametrize("reality", [None, lagging()])
+def test_a_believed_lag_is_a_part_of_the_right_model(reality):
+    """Beside a plant without lag and beside a real one: it leaves a right model alone, and no form is advised."""
+    answer = believed(reality, fp.ModelReferenced(fp.Affine(gain=-0.4), lag=LAG))
+    assert (answer.verdict, answer.change) == ("yes", ""), answer
+    assert answer.numbers["error_with"] == pytest.approx(answer.numbers["error_without"], rel=1e-3)
+
+
+def test_a_believed_dead_time_is_a_part_of_the_right_model_too():
+    """Where the problem states none; a dead time that it states is a fact."""
+    assert believed(None, fp.ModelReferenced(fp.Affine(gain=-0.4), cycles=5.0, measurement=2.0)).verdict == "yes"

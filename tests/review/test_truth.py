@@ -139,125 +139,96 @@ CASES: dict[str, Case] = {
     "a room that comes back with the time constant of its loss": Case(
         lambda: (reviewed.slow_room(), {"RHC": plans(iterations=1)["RHC"]}),
         {("RHC", "returns"): "yes"},
-        {("RHC", "returns", "factor"): (np.exp(-5e-4), 2e-5), ("RHC", "returns", "left"): (np.exp(-1.35), 0.1)},
-    ),
+        {("RHC", "returns", "factor"): (np.exp(-5e-4), 2e-5), ("RHC", "returns", "left"): (np.exp(-1.35), 0.1)}),
     "a limit of a rate": Case(
         lambda: (reviewed.limited_rate(), plans()),
         {("RHC", "limits"): "yes", ("RHC+FPI", "limits"): "yes", ("RHC+FPI", "pays"): "no"},
         {("RHC", "limits", "share_of_cycles"): (0, 0), ("RHC+FPI", "pays", "error_without"): (0.637, 0.01)},
         never=("problem",),
-        changes={("RHC+FPI", "follows"): LEAVE},
-    ),
+        changes={("RHC+FPI", "follows"): LEAVE}),
     "an angle that wraps": Case(
         lambda: (turntable(lambda t: ca.atan2(ca.sin(t), ca.cos(t))), plans(iterations=2)),
         {("problem", "turns"): "no"},
         {("problem", "turns", "jumps"): (1, 0)},
-        changes={("problem", "turns"): UNWRAP, ("RHC+FPI", "input_limits"): UNWRAP, ("RHC+FPI", "pays"): UNWRAP},
-    ),
+        changes={("problem", "turns"): UNWRAP, ("RHC+FPI", "input_limits"): UNWRAP, ("RHC+FPI", "pays"): UNWRAP}),
     "an angle that goes on": Case(
         lambda: (turntable(lambda t: t), plans(iterations=2)),
         {("problem", "turns"): "yes", ("RHC+FPI", "pays"): "yes", ("RHC+FPI", "returns"): "yes"},
-        never=("problem", "RHC", "RHC+FPI"),
-    ),
+        never=("problem", "RHC", "RHC+FPI")),
     "capped plans that lose the ball": Case(
         lambda: (ball(0.011), plans(iterations=1, tolerance=1e-2)),
         {("RHC", "plans"): "no", ("RHC", "follows"): "no"},
-        changes={("RHC", "follows"): MORE},
-    ),
+        changes={("RHC", "follows"): MORE}),
     "a servo and its recommended gain": Case(
         lambda: (reviewed.servo(), {str(g): plans(iterations=None, tolerance=None, gain=g)["RHC+FPI"] for g in SERVO}),
         {("-1.0", key): "no" for key in ("gain", "returns", "pays")},
-        {
-            (g, "pays", "error_with"): (e, 0.05 * e)
-            for g, e in zip(map(str, SERVO), (0.0130, 2.28e-4, 2.27e-4), strict=True)
-        },
+        {(g, "pays", "error_with"): (e, 0.05 * e) for g, e in zip(map(str, SERVO), (0.0130, 2.28e-4, 2.27e-4), strict=True)},
         never=("problem", "-1.97", "-2.12"),
-        changes={("-1.0", "returns"): "Set deformation.gain to -2."},
-    ),
+        changes={("-1.0", "returns"): "Set deformation.gain to -2."}),
     "a heater that would have to cool": Case(
         lambda: (reviewed.heater(), {"it": fp.ComputedTorque(fp.Exponential(3.0, integral=False))}),
         {("it", "input_limits"): "caution"},
         {("it", "input_limits", f"needed_{end}"): (u, 1e-3) for end, u in (("least", -1.13238), ("most", 3.53238))},
-        changes={("it", "input_limits"): "Slow the reference to a quarter of its speed."},
-    ),
+        changes={("it", "input_limits"): "Slow the reference to a quarter of its speed."}),
     "a map that swings while plans converge": Case(
         lambda: (reviewed.lift(), {"it": sigmoid(-1.0)}),
         {("it", "plans"): "yes", ("it", "gain"): "caution", ("it", "horizon"): "yes"},
-        changes={("it", "gain"): "Set deformation.gain to -4."},
-    ),
+        changes={("it", "gain"): "Set deformation.gain to -4."}),
     "a dead time that no gain makes up for": Case(
         lambda: (reviewed.tank(), {"it": sigmoid(-0.3), "predicted": fp.Predicted(sigmoid(-0.6), inputs=1.5)}),
         {("it", "gain"): "no", ("predicted", "gain"): "yes", ("predicted", "returns"): "caution"},
         {("it", "gain", "error_without"): (0.0865, 1e-3), ("it", "gain", "error"): (0.0956, 1e-3)},
-        changes=dict.fromkeys([("it", "gain"), ("it", "pays")], SEVEN),
-    ),
+        changes=dict.fromkeys([("it", "gain"), ("it", "pays")], SEVEN)),
     "a map of a right model behind a window that is too long": Case(
         lambda: (replace(reviewed.lift(), sensing=fp.Sensing({}, fp.SavitzkyGolay(41, 3))), {"it": sigmoid(-2.0)}),
         {("it", "model"): "no"},
-        changes={("it", "model"): "Set deformation.gain to -0.0625."},
-    ),
+        changes={("it", "model"): "Set deformation.gain to -0.0625."}),
     "the published iteration of two masses": Case(
         shipped("two_mass", "CTC", CTC6),
         {("CTC", "follows"): "no", (CTC6, "returns"): "yes", (CTC6, "pays"): "yes", (CTC6, "gain"): "yes"},
         {(CTC6, "returns", "factor"): (0.9964, 1e-3), (CTC6, "pays", "divided_by"): (80.0, 15.0)},
-        never=("problem", CTC6),
-    ),
+        never=("problem", CTC6)),
     "a gain that is too small for its pairing": Case(
         shipped("delayed_mass", PAIRED),
         {(PAIRED, "gain"): "no", (PAIRED, "pays"): "no"},
-        changes={(PAIRED, "follows"): "Set deformation.gain to -2."},
-    ),
+        changes={(PAIRED, "follows"): "Set deformation.gain to -2."}),
     "a biased sensor": Case(
         lambda: (biased(1.0), plans()),
         {("RHC+FPI", "pays"): "no"},
-        changes={("RHC+FPI", "pays"): "Mend the sensors: without their noise and bias it passes."},
-    ),
+        changes={("RHC+FPI", "pays"): "Mend the sensors: without their noise and bias it passes."}),
     "upper tanks that move by themselves": Case(
         foreign("quadruple_tank", "RHC", "CTC+FPI"),
         {("CTC+FPI", "inner"): "yes"},
         {("CTC+FPI", "inner", "rate_with_outputs_held"): (-0.018, 4e-3)},  # Johansson's slower zero
-        never=("RHC", "CTC+FPI"),
-    ),
+        never=("RHC", "CTC+FPI")),
     "upper tanks of the other point": Case(
         foreign("quadruple_tank", "CTC+FPI", variant="nonminimum"),
         {("CTC+FPI", "inner"): "no"},
-        {("CTC+FPI", "inner", "rate_with_outputs_held"): (0.013, 4e-3)},
-    ),
+        {("CTC+FPI", "inner", "rate_with_outputs_held"): (0.013, 4e-3)}),
     "an own map behind a dead time": Case(
         foreign("own_map", "RHC+FPI", "RHC+FPI, increment"),
-        {
-            ("RHC+FPI", "returns"): "no",
-            ("RHC+FPI", "model"): "no",
-            ("RHC+FPI, increment", "returns"): "yes",
-            ("RHC+FPI, increment", "model"): "yes",
-            ("RHC+FPI, increment", "latency"): "caution",
-        },
-    ),
+        {("RHC+FPI", key): "no" for key in ("returns", "model")}
+        | {("RHC+FPI, increment", key): "yes" for key in ("returns", "model")} | {("RHC+FPI, increment", "latency"): "caution"}),
     "a load on a spring, a swing of which leaves exp(-2 pi .015) of the last": Case(
         lambda: (SWINGING, {"CTC": fp.ComputedTorque(fp.Exponential(8.0))}),
         {("CTC", "returns"): "caution"},
-        {("CTC", "returns", "swing"): (0.910, 5e-3), ("CTC", "returns", "period"): (0.628, 3e-3)},
-    ),
+        {("CTC", "returns", "swing"): (0.910, 5e-3), ("CTC", "returns", "period"): (0.628, 3e-3)}),
     "an effort that keeps a room cold": Case(
         lambda: (replace(reviewed.slow_room(), cost=fp.Quadratic({"T": 1e-2}, effort={"u": 1.0})), plans()),
-        changes={("RHC", "follows"): "Move the weights of effort to deviation: it leaves out what holds the plant."},
-    ),
+        changes={("RHC", "follows"): "Move the weights of effort to deviation: it leaves out what holds the plant."}),
     "tanks that leak, whose plans end elsewhere": Case(
         shipped("leaking_tanks", "RHC+FPI"),
         {("RHC+FPI", "inner"): "yes", ("RHC+FPI", "follows"): "caution", ("RHC+FPI", "pays"): "caution"},
-        changes={("RHC+FPI", "pays"): LEAVE},
-    ),
+        changes={("RHC+FPI", "pays"): LEAVE}),
     "slots": Case(
         shipped("crane_slots", "slots+FPI"),
         {("slots+FPI", "follows"): "yes", ("slots+FPI", "pays"): "yes"},
-        never=("slots+FPI",),
-    ),
+        never=("slots+FPI",)),
     "a cascade whose target cures more than it spoils": Case(
         shipped("heat_exchanger", "Cascade, last target"),
         {("Cascade, last target", "model"): "yes", ("Cascade, last target", "pays"): "yes"},
         {("Cascade, last target", "model", "error_with"): (0.135, 1e-3)},
-        never=("Cascade, last target",),
-    ),
+        never=("Cascade, last target",)),
     **{name: of(task) for name, task in OWN.items()},
     "an actuator that the model lacks": of(lambda: (behind_an_actuator(0.4), law(-1.5, 3.0))),
     "an encoder that moves the command": of(lambda: seen(12, 2e-4, fp.SavitzkyGolay(5, 2)),
@@ -270,8 +241,7 @@ CASES: dict[str, Case] = {
         'noise: Weigh the changes of the inputs: Quadratic(..., rate={"F": 1.0}). The error is then 1.84 times as large.'),
     "rates of an input that are far too low": of(
         lambda: (within((-9.0, 9.0), {"u": (-0.2, 0.2)}), replace(follower(3.0), deformation=fp.ModelReferenced(fp.Affine(-0.5)))),
-        "input_limits: Slow the reference to a quarter of its speed. It helps, but the answer is then caution.",
-    ),
+        "input_limits: Slow the reference to a quarter of its speed. It helps, but the answer is then caution."),
     **{
         f"limits of {low} and {high}": of(
             lambda ends=(low, high): (within(ends), follower(3.0)),
@@ -284,34 +254,27 @@ CASES: dict[str, Case] = {
     },
     "a reference that begins in millimetres": of(
         lambda: units(reference=fp.Trajectory(lambda t: {"q": 500 * ca.cos(t)}), start={"q": 0.5}),
-        "sizes = The reference of q begins at", f"sizes: {KILO}", f"follows: {KILO}",
-    ),
+        "sizes = The reference of q begins at", f"sizes: {KILO}", f"follows: {KILO}"),
     "a reference in millimetres": of(
         lambda: units(reference=fp.Trajectory(lambda t: {"q": 500 * ca.sin(t)})),
-        "sizes = The reference needs 112 times the limits of u.", f"sizes: {KILO}", f"follows: {KILO}",
-    ),
+        "sizes = The reference needs 112 times the limits of u.", f"sizes: {KILO}", f"follows: {KILO}"),
     "noise in millimetres": of(
         lambda: units(sensing=fp.Sensing({"q": fp.Sensor(fp.Noise(5.0))}, DERIVED)),
-        "sizes = The noise of q is 5 m, and its", f"sizes: {LESS}",
-    ),
+        "sizes = The noise of q is 5 m, and its", f"sizes: {LESS}"),
     "noise in micrometres": of(
         lambda: units(sensing=fp.Sensing({"q": fp.Sensor(fp.Noise(5e3))}, DERIVED)),
-        "sizes = The noise of q is 5 000 m, and its", f"sizes: {LESS}",
-    ),
+        "sizes = The noise of q is 5 000 m, and its", f"sizes: {LESS}"),
     "an angle in degrees": of(
         lambda: units(plant=replace(mass().plant, coordinates={"q": "rad"}),
                       reference=fp.Trajectory(lambda t: {"q": 50 * ca.sin(t)})),
-        "sizes = The reference needs 11.2 times the limits of u.", "sizes: Divide the reference by 57.3: is it a slip of units?",
-    ),
+        "sizes = The reference needs 11.2 times the limits of u.", "sizes: Divide the reference by 57.3: is it a slip of units?"),
     "a late command that swings with more gain and falls with less": of(
         lambda: (pushed_away(1e3, dead_time=fp.DeadTime({"u": 0.31})), follower(1.2, integral=False)),
-        "input_gain = With 0.7 and 1.4", mismatch=40.0,
-    ),
+        "input_gain = With 0.7 and 1.4", mismatch=40.0),
     "a little force that holds no other plant": of(
         lambda: (pushed_away(0.252, dead_time=fp.DeadTime({"u": 0.17})), follower(3.0, integral=False)),
         "box = It is lost on 4 of 4 trial plants: one with k 40 % larger, b 40 % larger; one with k 40 % larger, b 40 % smaller; "
-        "one with k 40 % smaller, b 40 % smaller; one with k 40 % smaller, b 40 % larger", mismatch=40.0,
-    ),
+        "one with k 40 % smaller, b 40 % smaller; one with k 40 % smaller, b 40 % larger", mismatch=40.0),
     "a spring of the model that pulls with more than the largest force": of(
         lambda: (stiff(0.28), follower(3.0)), "box = It is lost on 1 of 2 trial plants: the model itself, "),
     "that spring among plants of the box": of(
@@ -323,8 +286,7 @@ CASES: dict[str, Case] = {
     "too much noise": of(
         lambda: seen(12, 0.02, fp.SavitzkyGolay(15, 2)),
         "noise: Measure the response with less noise. None of the changes that were run helps, 8 in all: estimator, rate "
-        "(estimator window 7, window 31, window 61, window 121; rate 4, 16, 2, 32).",
-    ),
+        "(estimator window 7, window 31, window 61, window 121; rate 4, 16, 2, 32)."),
     "a level that is held once": of(lambda: (
         replace(heater(), reference=fp.Trajectory(lambda t: {"T": 1.0 + 0 * t}), start={"T": 0.9}, limits=fp.Limits()),
         replace(follower(3.0, integral=False), deformation=fp.ModelReferenced(fp.Affine(-0.5))))),

@@ -85,7 +85,7 @@ def test_what_is_kept_is_not_run_again(task):
         (lambda task: (task, fp.Draws(12, 20.0, 6)), "seed was 5, is 6"),
         (lambda task: (replace(task, problem=replace(task.problem, duration=1.0)), DRAWS), "problem was "),
         (
-            lambda task: (replace(task, controllers={**task.controllers, "CTC": task.controllers["CTC+FPI"]}), DRAWS),
+            lambda t: (replace(t, controllers=t.controllers | {"CTC": t.controllers["CTC+FPI"]}), DRAWS),
             "controller 'CTC' was ",
         ),
     ],

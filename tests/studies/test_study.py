@@ -79,21 +79,18 @@ def test_a_drawn_plant_is_its_number(task):
     assert len({seed for seed, _ in more}) == len({exact for _, exact in more}) == 20
     assert [seed for seed, _ in drawn(task, percent=10.0)] == [seed for seed, _ in some]
     assert all(one.problem is task.problem for one in fp.Draws(3).of(task))  # noise alone
-    assert (
-        str(fp.Draws(3))
-        == "3 plants of seed 0, which differ in noise and stated spreads alone (--mismatch P draws parameters too)"
-    )
+    alone = "3 plants of seed 0, which differ in noise and stated spreads alone (--mismatch P draws parameters too)"
+    assert str(fp.Draws(3)) == alone
 
 
 def test_factors_are_log_uniform():
     """Logarithms of the factors are uniform between those of 0.6 and 1.4; signs and zeros stay."""
     values = {"a": 3.0, "b": -2.0, "zero": 0.0}
-    plant = fp.Plant(
-        {"y": "m"},
-        {"u": "N"},
+    known, moves = (
         {n: fp.Parameter(v, v, "1") for n, v in values.items()},
-        lambda q, v, u, p: {"y": u.u + p.a * q.y + p.b * v.y + p.zero},
+        lambda q, v, u, p: {"y": u.u + p.a * q.y + p.b * v.y},
     )
+    plant = fp.Plant({"y": "m"}, {"u": "N"}, known, moves)
     rest = fp.Trajectory(lambda t: {"y": 0 * t})
     problem = fp.Problem(plant=plant, reference=rest, start={"y": 0.0}, period=1e-2, duration=1.0)
     exact = np.array([one.problem.plant.exact for one in fp.Draws(1500, 40.0).of_problem(problem)])

@@ -183,9 +183,8 @@ NUMBERS = {
 
 def by_number(better: str) -> Any:
     """Pairs that are judged by a number of their own; where a larger one is better the same change is worse."""
-    mine = fp.Metric(
-        "mine", lambda _, run: NUMBERS[run.controller.removesuffix("+FPI")]["+FPI" in run.controller], better=better
-    )
+    own = lambda _, run: NUMBERS[run.controller.removesuffix("+FPI")]["+FPI" in run.controller]  # noqa: E731
+    mine = fp.Metric("mine", own, better=better)
     changes, more = {"duration": 0.09, "measure_from": 0.0}, {"metrics": [*tasks.two_mass.metrics, mine]}
     return compared(dict.fromkeys(NUMBERS, (Facts(), Facts())), changes, headline_metric="mine", **more)
 
@@ -277,11 +276,10 @@ def bounds(*, right: bool = False) -> Any:
     return found
 
 
-def headline(sensing: fp.Sensing | None = None) -> Any:
+def headline(**changes: Any) -> Any:
     """The headline of the van der Pol oscillator."""
     one = tasks.van_der_pol
-    changed = one if sensing is None else replace(one, problem=replace(one.problem, sensing=sensing))
-    return fp.compare(changed, seed=0, controllers=[*one.headline])
+    return fp.compare(replace(one, problem=replace(one.problem, **changes)), seed=0, controllers=[*one.headline])
 
 
 def late() -> Any:
@@ -328,58 +326,49 @@ NULL_TEST = r"disturbances its rms error is (\S+) times that without adaptation"
 NULL_RATIO = lambda found: {NULL_TEST: found["law+FPI"].null.ratio("y")}  # noqa: E731
 NOISE = "without noise; what noise costs: fpirhc study van_der_pol --margins noise -c RHC"
 WEAKENED = {"law+FPI": "doubtful"}  # a smaller error is no success yet
+OWN_MAP = {"RHC+FPI": "worse", "RHC+FPI, increment": "better"}
 SAID: dict[str, Said] = {
     "number": Said(partial(by_number, "smaller"), OUTCOMES, never=["contraction"]),  # of runs that are too short for one
     "larger number": Said(partial(by_number, "larger"), {n: TURNED.get(one, one) for n, one in OUTCOMES.items()}),
     "headline first": Said(
         two_pairs, {"B+FPI": "no difference", "A+FPI": "better"}, ["Smallest rms error: B+FPI, "],
         numbers=lambda _: {r"B\+FPI, (\S+) % of": 100 * math.sqrt(((0.2 / 1.757) ** 2 + (0.2 / 2) ** 2) / 2)},
-        best=frozenset({"B+FPI"}),
-    ),
+        best=frozenset({"B+FPI"})),
     "no cycle counts": Said(
         lambda: compared({"A": (Facts(), Facts())}, {"measure_from": PERIOD * (CYCLES - 0.4)}), {"A+FPI": "not comparable"},
-        ["A+FPI and A cannot be compared: an error is no number."],
-    ),
+        ["A+FPI and A cannot be compared: an error is no number."]),
     "no pair": Said(lambda: alone(problem(), far=Played("far", Facts(2.5, 0.2), Facts())), {}, [
-        "No controller is here both with and without adaptation. No controller follows; fpirhc review says why."
-    ]),
+        "No controller is here both with and without adaptation. No controller follows; fpirhc review says why."]),
     # An error that stays when a start is over, or a command at its limit: of the better one, or the simpler of two that are alike.
     "errs": Said(lambda: compared({"A": (Facts(), WIDE)}), words=[f"A+FPI {ERRS}."], rows={"A+FPI": ("", "errs 16.1 %")}),
     "made worse": Said(lambda: compared({"A": (WIDE, Facts())}), words=[f"A {ERRS}."], rows={"A": ("", "errs 16.1 %")}),
     "errs at a limit": Said(
         lambda: compared({"A": (replace(WIDE, sends="full", size=0.4), WIDE)}),
-        words=[f"A {ERRS} and stands at a limit in 31.4 % of the cycles."], rows={"A": ("", "errs 16.1 %")},
-    ),
+        words=[f"A {ERRS} and stands at a limit in 31.4 % of the cycles."], rows={"A": ("", "errs 16.1 %")}),
     "errs at first": Said(
         lambda: compared({"A": (Facts(), replace(WIDE, quarters=(1.2, 1.2, 0.1, 0.1)))}), {"A+FPI": "better"},
-        never=["still errs"], rows={"A+FPI": ("", "ok")},
-    ),
+        never=["still errs"], rows={"A+FPI": ("", "ok")}),
     "limit of a rate": Said(
         lambda: compared({"A": SWINGS(2.0)}, {"limits": fp.Limits({"c": (-LIMIT, LIMIT)}, rates={"c": (-200.0, 200.0)})}),
-        words=["is at a limit of its rate (c: -200 to 200 1/s^2), where nothing adapts"],
-    ),
+        words=["is at a limit of its rate (c: -200 to 200 1/s^2), where nothing adapts"]),
     "slip of units": Said(lambda: alone(tank(start={"y": 0.5}).with_exact(np.array([5e-3]))), words=[SLIP]),
     "no slip": Said(lambda: alone(tank()), never=[SLIP]),
     "steep": Said(
         steep, words=["% of its plans did not converge: give"], numbers=lambda found: {
             r"contraction factor is above 1 in (\S+) % of": 100 * found["law+FPI"].metrics["contraction.growing"][""],
-        },
-    ),
+        }),
     "nan": Said(dry, words=["of cycles a plan met nan, and the last plan went on: look at roots"]),
     "null test of a cure": Said(partial(lags, 2.0), {"law+FPI": "better"}, never=["times that without adaptation"]),
     "null test": Said(partial(lags, 4.95), {"law+FPI": "worse"}, numbers=NULL_RATIO),
     "null test at the limit": Said(partial(weak, -4.0), WEAKENED, ["disturbances its rms error is 282 times that"]),
     "null test beyond": Said(partial(weak, -4.02), WEAKENED, ["no disturbances it diverges."]),
-    "null test far beyond": Said(partial(weak, -6.0), WEAKENED, ["no disturbances it diverges."]),
     "range": wide(1.5, {"reference": fp.Trajectory(lambda t: {"y": 1.5 - ca.exp(-1e3 * t)}), "start": {"y": 2.0}}),
     "start": wide(0.5, {"start": {"y": 0.5}}),
     "limits": wide(4.0, {"limits": fp.Limits(states={"y": (-1.0, 3.0)}), "start": {"y": 1.0}}),
     "an open limit": wide(1.0, {"limits": fp.Limits(states={"y": (0.0, math.inf)}), "start": {"y": 1.0}}),
     "weight": wide(2.0, {"cost": fp.Quadratic(states={"y": 0.25}), "horizon": fp.Horizon(5, 1e-2), "start": {"y": 1.0}}),
     "rounding": wide(1.0, {"reference": fp.Trajectory(lambda t: {"y": 1e3 + 0 * t}), "start": {"y": 1e3 + 1e-7}}),
-    "bounds": Said(bounds, words=[
-        "Smallest rms error with the wrong model: fast,"
-    ], best=frozenset({"fast"})),
+    "bounds": Said(bounds, words=["Smallest rms error with the wrong model: fast,"], best=frozenset({"fast"})),
     "no bounds": Said(partial(bounds, right=True), never=["wrong model"]),
     "hard limit": Said(
         fast_cart, {"law+FPI": "hard limit left"},
@@ -387,32 +376,25 @@ SAID: dict[str, Said] = {
          "of the cycles of law. law+FPI against law: hard limit left (rms error x "],
         ratios={"x": 0.075},
         numbers=lambda found: {r"x' reaches (\S+) m/s, beyond": np.abs(found["law"].run["plant_state.x'"]).max()},
-        rows={"law": ("red", "leaves x'"), "law+FPI": ("red", "leaves x'"), "plan": ("", "ok")},
-    ),
+        rows={"law": ("red", "leaves x'"), "law+FPI": ("red", "leaves x'"), "plan": ("", "ok")}),
     "hard limit, no pair": Said(
-        lambda: replace(whole := fast_cart(), entries=whole.entries[1:]), words=["law leaves a limit: x' reaches"]
-    ),
+        lambda: replace(whole := fast_cart(), entries=whole.entries[1:]), words=["law leaves a limit: x' reaches"]),
     "no noise": Said(headline, words=[NOISE]),
-    "noise": Said(partial(headline, fp.Sensing({"q''": fp.Sensor(noise=fp.Noise(0.1))})), never=[NOISE]),
+    "noise": Said(partial(headline, sensing=fp.Sensing({"q''": fp.Sensor(noise=fp.Noise(0.1))})), never=[NOISE]),
     "lost": Said(
         lambda: alone(tank(limits=fp.Limits({"u": (4.0, 5.0)}), input_before={"u": 4.0})), words=["No controller follows"],
-        rows={"law": ("", "does not follow")}, best=frozenset(),
-    ),
+        rows={"law": ("", "does not follow")}, best=frozenset()),
     # no call is done in a nanosecond
     "late": Said(lambda: alone(tank(period=1e-9, duration=1e-8)), rows={"law": ("", "late 100 %")}, best=frozenset({"law"})),
     "time of a cycle": Said(late, rows={"RHC": ("", "ok 2 / 40 / 1e6")}),
     # 7e-6 becomes .39 mol/l in the only weighted output, though the jacket's error is smaller; its model is exact
     "cstr": Said(partial(of_another, "cstr", "RHC+FPI"), {"RHC+FPI": "worse"}, ratios={"C_b": 5.7e4}),
     "quadruple_tank": Said(
-        partial(of_another, "quadruple_tank", "RHC+FPI"), {"RHC+FPI": "better"}, ratios={"h1": 1 / 3.6, "h2": 1 / 37}
-    ),
+        partial(of_another, "quadruple_tank", "RHC+FPI"), {"RHC+FPI": "better"}, ratios={"h1": 1 / 3.6, "h2": 1 / 37}),
     "drug_infusion": Said(
-        partial(of_another, "drug_infusion", "RHC+FPI", duration=60.0), {"RHC+FPI": "better"}, ratios={"C1": 4e-3}
-    ),
+        partial(of_another, "drug_infusion", "RHC+FPI", duration=60.0), {"RHC+FPI": "better"}, ratios={"C1": 4e-3}),
     # paired, the loop diverges through the dead time; as an increment the same map halves the error
-    "own_map": Said(
-        partial(of_another, "own_map", "RHC+FPI", "RHC+FPI, increment"), {"RHC+FPI": "worse", "RHC+FPI, increment": "better"}
-    ),
+    "own_map": Said(partial(of_another, "own_map", *OWN_MAP), OWN_MAP),
 }  # fmt: skip
 
 
