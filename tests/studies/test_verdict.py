@@ -87,12 +87,12 @@ def problem() -> fp.Problem:
 
 
 def compared(cases: dict[str, tuple[Facts, Facts]], changes: dict[str, Any] | None = None, **more: Any) -> Any:
-    """The comparison of pairs 'NAME' and 'NAME+FPI'."""
+    """The comparison of pairs 'NAME' and 'NAME+FPI', which tells of its controllers alone: nothing is compiled."""
     controllers: dict[str, Controller] = {}
     for name, facts in cases.items():
-        controllers[name] = Played(name, *facts)
-        controllers[f"{name}+FPI"] = Played(name, *facts, ADAPTS)
-    return fp.compare(tasks.made(replace(problem(), **(changes or {})), controllers, **more), seed=0, compiled=False)
+        controllers |= {name: Played(name, *facts), f"{name}+FPI": Played(name, *facts, ADAPTS)}
+    task = tasks.made(replace(problem(), **(changes or {})), controllers, **more)
+    return fp.compare(task, seed=0, compiled=False, progress=lambda what, *_: controllers[what])
 
 
 def findings(comparison: Any) -> dict[str, Any]:
