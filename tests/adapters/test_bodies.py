@@ -358,9 +358,6 @@ def test_the_board_is_asked_when_its_cycle_is_over(monkeypatch):
     assert first.closed
 
 
-# Wrong uses
-
-
 def test_a_wrong_argument_of_an_adapter_is_named():
     """A loaded task in place of an argument that is checked; no package is asked for before."""
     task = fp.load_problem("two_mass")

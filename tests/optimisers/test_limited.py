@@ -79,18 +79,15 @@ def test_nine_states_and_three_inputs_with_walls_have_the_optimum_of_ipopt():
     assert room.min() < 1e-6
 
 
-def behind_a_wall(speed: float):
-    """The quadrotor flies towards a wall at x = .3 m: its position is held by a limit of its tilt, four integrations away."""
-    case = FOREIGN["quadrotor"]()
-    limits = fp.Limits(inputs=dict(case.limits.inputs), states={"tilt": (-0.35, 0.35), "x": (-3.0, 0.3)})
-    ocp, data = horizon_of(case.plant, case.reference, case.horizon, case.cost, limits)
-    return ocp, data, np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
-
-
 @pytest.mark.parametrize("speed", [1.0, 1.2, 1.4])
 def test_a_wall_that_the_inputs_feel_late_is_solved_in_one_call(speed):
-    """Multipliers of neighbouring stages are nearly dependent: the barrier must go down to 1e-13 and less."""
-    ocp, data, first = behind_a_wall(speed)
+    """The quadrotor flies towards x = .3 m: its position is held by a limit of its tilt, four integrations away.
+
+    Multipliers of neighbouring stages are nearly dependent: the barrier must go down to 1e-13 and less.
+    """
+    case, first = FOREIGN["quadrotor"](), np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
+    limits = fp.Limits(inputs=dict(case.limits.inputs), states={"tilt": (-0.35, 0.35), "x": (-3.0, 0.3)})
+    ocp, data = horizon_of(case.plant, case.reference, case.horizon, case.cost, limits)
     plan = solved(ocp, first, data)
     best = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data)
     assert (plan.status, plan.calls) == (fp.Status.OK, 1)

@@ -21,6 +21,7 @@ from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidValue, NotSupported
 TRACK = fp.Exponential(rate=6.0)
 SHAPE = fp.Sigmoid(gain=-0.5, scale=50.0)
 LAW = fp.ComputedTorque(TRACK, SHAPE)
+CONTROLLERS = {"law": LAW, "plan": fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3))}
 PROBLEM = replace(two_masses(), duration=0.4)
 PLANT = fp.Plant(
     {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1.2, 1.0, "kg")}, lambda q, v, u, p: {"y": u.u / p.m - 2.0 * q.y}
@@ -43,9 +44,9 @@ def small(problem=SMALL, controller=GAINED, **settings) -> fp.Stepper:
 
 
 @cache
-def stepper() -> fp.Stepper:
+def stepper(name: str = "law", *, compiled: bool = False) -> fp.Stepper:
     """Of two masses, for tests that leave it as it is."""
-    return fp.Stepper(PROBLEM, LAW, compiled=False)
+    return fp.Stepper(PROBLEM, CONTROLLERS[name], compiled=compiled)
 
 
 # What a call takes and gives
@@ -290,20 +291,11 @@ def test_every_status_has_a_place_and_a_remedy():
 
 # The time of a step follows that of the step before; a clock that was set is believed
 PERIOD = PROBLEM.period
-CLOCKED = {
-    "computed torque": fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=50.0)),
-    "plan": fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3)),
-}
 
 
-@cache
-def stepper_of(name: str = "computed torque", *, compiled: bool = False) -> fp.Stepper:
-    return fp.Stepper(PROBLEM, CLOCKED[name], compiled=compiled)
-
-
-def stepped(times: list[float], name: str = "computed torque", *, compiled: bool = False) -> list[fp.Status]:
+def stepped(times: list[float], name: str = "law", *, compiled: bool = False) -> list[fp.Status]:
     """Statuses of steps at these times with one sample."""
-    own, statuses = stepper_of(name, compiled=compiled), []
+    own, statuses = stepper(name, compiled=compiled), []
     memory, x, r = own.start(), np.array(PROBLEM.start_state), np.zeros(2)
     for t in times:
         command, memory = own.step(t, x, r, memory)
@@ -324,7 +316,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("name", CLOCKED)
+@pytest.mark.parametrize("name", CONTROLLERS)
 @pytest.mark.parametrize("which", WRONG)
 def test_a_time_that_cannot_follow_is_skipped(name, which):
     """It is BAD_TIME in its own cycle alone: the next good time is that of an ordinary cycle."""
@@ -338,7 +330,7 @@ def test_a_time_that_cannot_follow_is_skipped(name, which):
 
 def test_a_skipped_time_changes_nothing():
     """Command, count and later commands are those of a bad sample."""
-    own, x, r = stepper_of(), np.array(PROBLEM.start_state), np.zeros(2)
+    own, x, r = stepper(), np.array(PROBLEM.start_state), np.zeros(2)
     command, memory = own.step(0.0, x, r, own.start())
     held, after = own.step(1e18, x, r, memory)
     assert np.array_equal(held, command)
