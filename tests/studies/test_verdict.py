@@ -210,13 +210,11 @@ def tank(**changes: Any) -> fp.Problem:
 
 
 def alone(problem: fp.Problem, **laws: Controller) -> Any:
-    """The comparison of these controllers."""
     every = laws or {"law": fp.ComputedTorque(fp.Exponential(rate=2.0))}
     return fp.compare(tasks.made(problem, every), seed=0, compiled=False)
 
 
 def paired(problem: fp.Problem, law: Any, deformation: Deformation) -> Any:
-    """The comparison of a law with itself and a deformation."""
     return alone(problem, **{"law": law, "law+FPI": law.with_deformation(deformation)})
 
 
@@ -297,7 +295,6 @@ def wide(scale: float, changes: dict[str, Any]) -> Said:
 
 
 def of_another(name: str, *names: str, **changes: Any) -> Any:
-    """The comparison of a plant of others."""
     task = abroad.load(name)
     found = fp.compare(replace(task, problem=replace(task.problem, **changes)), seed=0, controllers=["RHC", *names])
     assert found["RHC+FPI"].null.fails() == (str(found.outcome) == "worse")
