@@ -186,6 +186,8 @@ def test_a_cell_of_a_grid_is_the_run_with_its_numbers(task):
     refused = fp.study(task, grid, controllers=both, compiled=False)
     assert (refused.table.outcome.tolist()[3::2], "gain" in refused.table.why[5]) == (["finished", "refused"], True)
     assert [refused.view.tables[0].rows[1].cells[k] for k in (1, 4, 5)] == ["lost"] * 3  # worst, median, difference
+    turned = fp.study(task, grid, controllers=both[::-1], compiled=False)
+    assert turned.view.tables[0].rows[1].cells[5] == "other lost"
 
 
 def of_case(changes: Any) -> Any:
