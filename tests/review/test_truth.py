@@ -20,22 +20,7 @@ import pytest
 from abroad import load
 from helpers import reviewed
 from helpers.kinds import slow_but
-from helpers.reviewed import (
-    NOISY,
-    answers,
-    ball,
-    behind_an_actuator,
-    biased,
-    heated,
-    heater,
-    law,
-    mass,
-    motor,
-    plans,
-    pushed_away,
-    torque,
-    turntable,
-)
+from helpers.reviewed import NOISY, answers, ball, biased, heated, heater, law, mass, motor, plans, torque, turntable
 
 import fpirhc as fp
 
@@ -91,15 +76,13 @@ SERVO = -1.0, -1.97, -2.12
 DERIVED = fp.SavitzkyGolay(15, 2)
 KILO = "Divide the reference by 1 000: is it a slip of units?"
 LESS = "Set the noise of q to 0.005 m: is it a slip of units?"
+LATE = fp.DeadTime({"V": 0.01})
 OWN = {
     "a gain that is refused": lambda: (motor(), law(-9.0)),
     "a gain that is too small": lambda: (motor(1.2), law(0.01)),
     "a gain of the wrong sign behind a noisy encoder": lambda: (motor(0.7, sensing=NOISY), law(2.0)),
     "a gain that is too large": lambda: (mass(), torque(-20.0)),
-    "a gain of the wrong sign behind a prediction": lambda: (
-        motor(0.7, dead_time=fp.DeadTime({"V": 0.01})),
-        fp.Predicted(law(1.0), inputs=0.01),
-    ),
+    "a gain of the wrong sign behind a prediction": lambda: (motor(0.7, dead_time=LATE), fp.Predicted(law(1.0), 0.01)),
 }
 
 
@@ -129,7 +112,7 @@ def seen(limit: float, noise: float, own: Any) -> tuple[fp.Problem, Any]:
 
 def stiff(force: float) -> fp.Problem:
     """The spring of the model pulls with 6 N/m."""
-    one = pushed_away(force)
+    one = reviewed.pushed_away(force)
     known = {**one.plant.parameters, "k": fp.Parameter(6.0, 4.0, "1")}
     return replace(one, plant=replace(one.plant, parameters=known))
 
@@ -213,6 +196,7 @@ CASES: dict[str, Case] = {
         lambda: (SWINGING, {"CTC": fp.ComputedTorque(fp.Exponential(8.0))}),
         {("CTC", "returns"): "caution"},
         {("CTC", "returns", "swing"): (0.910, 5e-3), ("CTC", "returns", "period"): (0.628, 3e-3)}),
+    "twice as many of its swings": of(lambda: (replace(SWINGING, duration=8.0), follower(8.0))),
     "an effort that keeps a room cold": Case(
         lambda: (replace(reviewed.slow_room(), cost=fp.Quadratic({"T": 1e-2}, effort={"u": 1.0})), plans()),
         changes={("RHC", "follows"): "Move the weights of effort to deviation: it leaves out what holds the plant."}),
@@ -230,7 +214,7 @@ CASES: dict[str, Case] = {
         {("Cascade, last target", "model", "error_with"): (0.135, 1e-3)},
         never=("Cascade, last target",)),
     **{name: of(task) for name, task in OWN.items()},
-    "an actuator that the model lacks": of(lambda: (behind_an_actuator(0.4), law(-1.5, 3.0))),
+    "an actuator that the model lacks": of(lambda: (reviewed.behind_an_actuator(0.4), law(-1.5, 3.0))),
     "an encoder that moves the command": of(lambda: seen(12, 2e-4, fp.SavitzkyGolay(5, 2)),
         "noise: Take the estimator SavitzkyGolay(window=41, degree=2). The error is then 6.3 times as large."),
     "an encoder that moves the command to its limits": of(lambda: seen(1.75, 1e-3, fp.PositionDifference()),
@@ -269,10 +253,10 @@ CASES: dict[str, Case] = {
                       reference=fp.Trajectory(lambda t: {"q": 50 * ca.sin(t)})),
         "sizes = The reference needs 11.2 times the limits of u.", "sizes: Divide the reference by 57.3: is it a slip of units?"),
     "a late command that swings with more gain and falls with less": of(
-        lambda: (pushed_away(1e3, dead_time=fp.DeadTime({"u": 0.31})), follower(1.2, integral=False)),
+        lambda: (reviewed.pushed_away(1e3, dead_time=fp.DeadTime({"u": 0.31})), follower(1.2, integral=False)),
         "input_gain = With 0.7 and 1.4", mismatch=40.0),
     "a little force that holds no other plant": of(
-        lambda: (pushed_away(0.252, dead_time=fp.DeadTime({"u": 0.17})), follower(3.0, integral=False)),
+        lambda: (reviewed.pushed_away(0.252, dead_time=fp.DeadTime({"u": 0.17})), follower(3.0, integral=False)),
         "box = It is lost on 4 of 4 trial plants: one with k 40 % larger, b 40 % larger; one with k 40 % larger, b 40 % smaller; "
         "one with k 40 % smaller, b 40 % smaller; one with k 40 % smaller, b 40 % larger", mismatch=40.0),
     "a spring of the model that pulls with more than the largest force": of(

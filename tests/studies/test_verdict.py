@@ -109,7 +109,7 @@ RATIOS: dict[str, tuple[Facts, Facts, str, dict[str, float] | None]] = {
     "one lower": (Facts(), Facts(0.445), "better", {"z": 1.0, "y": 0.89}),
     "one higher": (Facts(), Facts(0.56), "worse", {"y": 1.12, "z": 1.0}),
     "one of each": (Facts(), Facts(0.1, 0.9), "mixed", {"z": 1.8, "y": 0.2}),
-    "minor beside the other": (Facts(0.5, 1e-5), Facts(0.1, 1e-4), "better", {"y": 0.2}),
+    "minor beside the other": (Facts(0.5, 1.1e-3), Facts(0.1, 1e-4), "better", {"y": 0.2}),
     "small before and after": (Facts(0.5, 1e-3), Facts(1e-3, 1e-2), "mixed", {"z": 10.0, "y": 2e-3}),
     "both beyond the motion": (Facts(2.5), Facts(2.2, 0.2), "not comparable", None),
     "one beyond the motion": (Facts(2.5), Facts(0.6, 0.2), "better", {"z": 0.4, "y": 0.24}),
@@ -287,6 +287,12 @@ def late() -> Any:
         return fp.compare(tasks.van_der_pol, seed=0, controllers=["RHC"], compiled=False)
 
 
+def disturbed() -> tuple[fp.Problem, dict[str, Controller]]:
+    """A plant at its set-point that a disturbance moves by 1.54 m, and laws that leave .04, 1.31 and 1.99 m."""
+    laws = {n: fp.ComputedTorque(fp.Exponential(rate)) for n, rate in {"good": 20.0, "fair": 3.6, "bad": 2.9}.items()}
+    return tank(disturbances={"y": fp.Formula(lambda t: 8.0 * ca.sin(2 * np.pi * 0.5 * t))}), laws
+
+
 def wide(scale: float, changes: dict[str, Any]) -> Said:
     """An error is measured against the range of the reference, or how far the start is from it, m; else weight, limits, or 1."""
     share = lambda found: {r"rms error: law, (\S+) % of the range": 100 * found["law"].errors["y"] / scale}  # noqa: E731
@@ -378,6 +384,9 @@ SAID: dict[str, Said] = {
     "lost": Said(
         lambda: alone(tank(limits=fp.Limits({"u": (4.0, 5.0)}), input_before={"u": 4.0})), words=["No controller follows"],
         rows={"law": ("", "does not follow")}, best=frozenset()),
+    "disturbed": Said(
+        lambda: alone(disturbed()[0], **disturbed()[1]),
+        rows={"good": ("", "ok"), "fair": ("", "errs 87.3 %"), "bad": ("", "does not follow")}),
     # no call is done in a nanosecond
     "late": Said(lambda: alone(tank(period=1e-9, duration=1e-8)), rows={"law": ("", "late 100 %")}, best=frozenset({"law"})),
     "time of a cycle": Said(late, rows={"RHC": ("", "ok 2 / 40 / 1e6")}),
@@ -420,12 +429,10 @@ def test_what_is_said(name):
 
 def test_a_held_reference_diverges_where_the_plant_left_alone_does_better():
     """More than what is off at the start is no divergence beside a disturbance that moves the plant by more."""
-    laws = {n: fp.ComputedTorque(fp.Exponential(rate=rate)) for n, rate in {"good": 20.0, "bad": 2.9}.items()}
-    disturbed = tank(disturbances={"y": fp.Formula(lambda t: 8.0 * ca.sin(2 * np.pi * 0.5 * t))})
-    one = tasks.made(disturbed, laws, cases=fp.Cases({"usual": {}}))
-    table = fp.study(one, fp.CasesOf(), compiled=False).table.set_index("controller")
-    assert table.outcome.to_dict() == {"good": "finished", "bad": "diverged"}
-    assert table.error["good"] > 1
+    problem, laws = disturbed()
+    table = fp.study(tasks.made(problem, laws, cases=fp.Cases({"usual": {}})), fp.CasesOf(), compiled=False).table
+    assert table.outcome.tolist() == ["finished", "finished", "diverged"]
+    assert table.error[0] > 1
 
 
 def test_a_hard_limit_that_a_run_breaks_is_told():
