@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import abroad
 import casadi as ca
 import numpy as np
 import pytest
@@ -105,6 +106,19 @@ def test_it_is_the_extended_filter_of_the_books():
     own = memory[stepper.memory.slice("observer_covariance")].reshape(2, 2)
     np.testing.assert_allclose(own, expected, rtol=1e-10)
     assert np.linalg.eigvalsh(own).min() > 0
+
+
+def test_what_decays_need_not_be_observed():
+    """Of propofol the plasma is measured; the effect site shows nowhere, and is believed by the model alone, as late as samples."""
+    observer = fp.KalmanFilter(measured={"C1": 1e-2}, noise={"C1": 0.3, "C2": 0.05, "C3": 0.05})
+    settings: dict[str, Any] = {
+        "sensing": fp.Sensing({}, fp.VelocityDifference(), measured=["C1"], observer=observer),
+        "dead_time": fp.DeadTime(inputs={"u": 1 / 6}, measurement=2 / 6),
+        "duration": 15.0,
+        "measure_from": 5.0,
+    }
+    result = run(replace(abroad.load("drug_infusion").problem, **settings), fp.ExactModel(TRACK))
+    np.testing.assert_allclose(result["state"][3:], result["plant_state"][1:-2], atol=1e-11)
 
 
 def test_a_state_that_cannot_be_observed_is_named_before_the_run():
