@@ -245,21 +245,22 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
     """Print the answers about the problem and every controller, those that are yes as a count."""
     for name, answers in found.answers.items():
         shown = [one for one in answers if verbose or one.verdict != "yes"]
-        told = [f"{len(answers) - len(shown)} yes"] * (len(shown) < len(answers))
-        gains = [one.numbers[name] for one in answers for name in one.numbers if name == "recommended_gain"]
-        told += [f"recommended gain: {number(gain)}" for gain in gains]
-        say(name, "bold", f": {', '.join(told)}" * bool(told))
+        told = [f"{len(answers) - len(shown)} of {len(answers)} yes"] * (len(shown) < len(answers))
+        told += [f"recommended gain: {number(g)}" for a in answers if (g := a.numbers.get("recommended_gain"))]
+        say(name, "bold", f": {', '.join(told)}" * bool(told)) if answers else None
         for change in dict.fromkeys(one.change for one in shown):  # once, below its rows
-            rows = [one for one in shown if one.change == change]
-            brief = len(rows) > 1 and rows[0].verdict == "unknown" and not verbose
+            rows = sorted((one for one in shown if one.change == change), key=lambda one: one.verdict != "no")
+            above = name != "problem" and change in {one.change for one in found.answers["problem"] if change}
+            brief = (above or (len(rows) > 1 and rows[0].verdict == "unknown")) and not verbose
             for one in rows[: 1 if brief else None]:
                 every = ", ".join(f"{name} {number(value)}" for name, value in one.numbers.items()) * verbose
                 whole = f"{one.question} {one.evidence}".strip() + f" ({every})" * bool(every)
-                what = f"{len(rows)} questions" if brief else whole
+                what = whole if not brief else one.question if len(rows) == 1 else f"{len(rows)} questions"
+                what += " (for the reason above)" * (above and brief)
                 say(f"  {one.verdict:7s} {what}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
-            these = f"For these {len(rows)}: " * (len(rows) > 1 and not brief)
-            change = change if verbose else re.sub(r"( helps, [^()]*) \(.*?\)\.", r"\1.", change)  # what was run
-            say(f"          -> {these}{change}", "bold") if change else None
+            do = f"For these {len(rows)}: " * (len(rows) > 1 and not brief) + change
+            do = do if verbose else re.sub(r"( helps, [^()]*) \(.*?\)\.", r"\1.", do)  # what was run
+            say(f"          -> {do}", "bold") if change and not (above and brief) else None
     advised = {one.change for some in found.answers.values() for one in some if one.verdict in ("no", "caution")}
     first = "Take one advice at a time, the uppermost first, and ask again after each.\n" * (len(advised) > 1)
     say(first + ", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))

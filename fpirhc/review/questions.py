@@ -18,6 +18,7 @@ from fpirhc.deformation.base import own_gain
 from fpirhc.errors import NotSupported, require
 from fpirhc.plant.chain import zero_dynamics
 from fpirhc.plant.plant import Plant
+from fpirhc.review import experiments
 from fpirhc.review.experiments import BUSY, GOOD, LATE, LITTLE, SLIGHT, WORSE, Case, ladder, predictor, slips, with_gain
 from fpirhc.simulation.ranges import TOLERANCE, hard_limits, misplaced
 from fpirhc.simulation.trials import ModelAsPlant, spoils
@@ -29,18 +30,17 @@ from fpirhc.symbolic.expression import TINY
 
 MINOR, ROUNDING, TIMID = 1e-3, 1e-6, 10.0  # added error, of the largest, and of the task; times it at a calm gain
 NEAR, FAR, BAD = 0.2, 0.5, 1.0  # errors as shares of the task: it follows, it does not, and adaptation shows nothing
-MOSTLY, LEFT, ROOM = 0.5, 0.1, 0.8  # shares: cycles at a limit that show no loop; push that latency leaves; of a limit
-CALM, CHATTER, RINGING = 0.1, 0.01, 0.9  # step of a command a cycle: mean, rms from noise; what a swing leaves
-SATURATED, OFFSET, FAILS = 0.2, 0.8, 0.05  # share of cycles at a limit; mean as one of rms; share of plans that fail
+LEFT, SATURATED = experiments.LEFT, 0.2  # of a push; of cycles at a limit
+MOSTLY, ROOM, OFFSET, FAILS = 0.5, 0.8, 0.8, 0.05  # shares: at a limit, of a limit, mean of rms, plans that fail
+CALM, CHATTER = 0.1, 0.01  # step of a command a cycle: mean, rms from noise
 TURNED = "Mend the sign of the inputs in the model: with those of the plant turned it follows."
 GROWS = "{left:%} of the push is left after {pushed}| of one ten times as large {most_left:%}"
 MODEL = "the model itself"  # among the trial plants
-SHORTER = "the relative error is {error:%}| with twice the stages the loop is lost ({error_with_twice_the_horizon:%})"
 MOVES = "commands change by {mean_step:%} of their range in a cycle"
-RINGS = "it swings with a period of {period} {time}, and a swing leaves {swing:%} of the last"
-BEST = "| {error_without:%} without adaptation| {error_recommended:%} at {recommended_gain:4}"
-BUSIER = "the total variation of {of} is {movement:r}| {movement_without:r} without adaptation"
-RESERVE = "the relative error is {error:%}| {error_at_twice:%} at twice the gain" + BEST
+RINGS = "it swings every {period} {time}| a swing is {swing:%} of the last| commands are at limits in {at_a_limit:%} of cycles"
+BEST = "| the relative error is {error:%}| {error_without:%} without adaptation| {error_recommended:%} at {recommended_gain:4}"
+BUSIER = "it converges, but moves too much| the total variation of {of} is {movement:r}| {movement_without:r} without adaptation"
+RESERVE = "it converges without reserve" + BEST + "| {error_at_twice:%} at twice the gain"
 SAID = {1.0: "error", -1.0: "error_turned", 0.5: "error_at_half", 2.0: "error_at_twice", 4.0: "error_at_four_times"}
 Numbers = Mapping[str, float]
 
@@ -80,12 +80,6 @@ class Question:
 def _turns(case: Case) -> Fact | None:
     found = whole_turns(case.problem)
     return found and Fact(Verdict.NO if found[1] else Verdict.YES, {"jumps": found[1]}, found[0], root=True)
-
-
-def _posed(case: Case) -> Fact | None:
-    finite = np.isfinite(needed_commands(case.problem, case.bench.nominal["plant_state"])).all(axis=1)
-    verdict = Verdict.YES if finite.all() else Verdict.CAUTION if case.problem.plant.equations.hidden else Verdict.NO
-    return Fact(verdict, {"share_finite": finite.mean()}, root=True) if len(finite) else None
 
 
 def _inside(case: Case) -> Fact | None:
@@ -155,16 +149,17 @@ def _returns(case: Case) -> Fact:
     bench = case.bench
     require(bench.held(bench.nominal) <= MOSTLY, "Commands stand at limits, so a push shows nothing: mend that first.")
     back, far, step = bench.back, bench.along[0], bench.steps(bench.start)
-    worst, stuck = max(one.factor for one in bench.along), max(back.held, far.held)
-    calm = not (rings := back.swing > RINGING and back.left > LEFT) and back.left <= GOOD and worst < 1 and step <= CALM
-    verdict = Verdict.YES if calm else Verdict.NO if bench.lost else Verdict.CAUTION
+    worst, swings = max(one.factor for one in bench.along), far if all(one.grows for one in bench.along) else back
+    stuck = max(back.held, far.held)
+    calm = not swings.rings and back.left <= GOOD and worst < 1 and step <= CALM
+    verdict = Verdict.YES if calm else Verdict.NO if bench.lost or swings.grows else Verdict.CAUTION
     numbers = {"left": back.left, "left_of_ten_times": far.left, "factor": back.factor, "largest_factor": worst}
-    numbers |= {"swing": back.swing, "period": back.cycles * case.problem.period} if back.swing else {}
+    numbers |= {"swing": swings.swing, "period": swings.cycles * case.problem.period} if swings.swing else {}
     numbers |= {"mean_step": step} | ({"at_a_limit": stuck} if stuck else {})
     numbers |= {"most_left": max(one.left for one in bench.along)} if worst >= 1 else {}
-    says = GROWS * (worst >= 1) or MOVES * (step > CALM) if back.left <= GOOD else ""
-    ways = "limits" * (stuck > max(SATURATED, bench.held(bench.start)))
-    return Fact(verdict, numbers, ways=ways, says=says or RINGS * rings)
+    says = (GROWS * (worst >= 1) or MOVES * (step > CALM)) * (back.left <= GOOD) or RINGS * swings.rings
+    ways = "estimator " * swings.rings + "limits" * (stuck > max(SATURATED, bench.held(bench.start)))
+    return Fact(verdict, numbers, ways=ways, root=swings.grows, says=says)
 
 
 def _plans(case: Case) -> Fact | None:
@@ -197,11 +192,10 @@ def _horizon(case: Case) -> Fact | None:
     with compiled_plans(yes=False):  # a loop for one run
         run = replace(bench, problem=replace(bench.problem, horizon=longer)).run(cycles=short.cycles)
     numbers |= {"error_with_twice_the_horizon": (long := bench.share(run))}
-    helps, lost = long < own / WORSE and own - long > SLIGHT, own <= BAD < long
+    helps = long < own / WORSE and own - long > SLIGHT
     numbers |= {"recommended_stages": longer.stages} if helps else {}
-    change = f"Give the horizon {longer.stages} stages." * helps + "Do not lengthen it." * lost
-    verdict = Verdict.NO if helps and own > BAD >= long else Verdict.CAUTION if change else Verdict.YES
-    return Fact(verdict, numbers, change=change, says=SHORTER * lost)
+    verdict = Verdict.YES if not helps else Verdict.NO if own > BAD >= long else Verdict.CAUTION
+    return Fact(verdict, numbers, change=f"Give the horizon {longer.stages} stages." * helps)
 
 
 def _box(case: Case) -> Fact | None:
@@ -215,12 +209,8 @@ def _box(case: Case) -> Fact | None:
     good, most = 1 - len(lost) / len(found), np.max(found, axis=0)
     verdict = Verdict.YES if good == 1 else Verdict.CAUTION if good else Verdict.NO
     numbers = {"share_that_come_back": good, "plants": len(found), "left": most[0], "error": most[1]}
-    change = "Mend the window, the gain or the weights first: the loop is lost with a right model, too." * (
-        MODEL in lost
-    )
-    return Fact(
-        verdict, numbers, f"{len(lost)} of {len(found)} trial plants{': ' * bool(lost)}{'; '.join(lost)}", change
-    )
+    told, ways = f"{len(lost)} of {len(found)} trial plants{': ' * bool(lost)}{'; '.join(lost)}", "estimator"
+    return Fact(verdict, numbers, told, ways=ways * (MODEL in lost))
 
 
 def _called(plant: Plant, exact: np.ndarray) -> str:
@@ -328,8 +318,8 @@ def recommended_gain(case: Case) -> Fact:
     numbers |= {"recommended_times": times, "recommended_gain": times * own_gain(controller.deformation)[1]}
     numbers |= {"error_recommended": rung.error, "movement_recommended": rung.moves[worst]}
     change = set_gain(controller, times) + price(numbers["error"], rung.error) * ladder(case).rungs[1.0].admitted
-    ways = "model gain" * any(slips(case.problem))
-    return fact._replace(verdict=Verdict.CAUTION if right else fact.verdict, numbers=numbers, change=change, ways=ways)
+    told: Any = {"ways": "model gain" * any(slips(case.problem)), "says": fact.says or "a larger gain is better" + BEST}
+    return fact._replace(verdict=Verdict.CAUTION if right else fact.verdict, numbers=numbers, change=change, **told)
 
 
 def price(before: float, after: float) -> str:
@@ -361,8 +351,8 @@ def gain_by_run(case: Case) -> Fact:
         verdict = Verdict.NO if best or found.alone <= GOOD else Verdict.UNKNOWN
     elif calm and ratio > (WORSE if reserve and not spare else LITTLE):
         best = 1.0
-    lost = f"{'a push grows' if own.admitted else 'it is refused'}| the relative error is {{error:%}}{BEST}"
-    says = lost * (own.error < found.alone) if not right else "" if not poor else RESERVE if calm else BUSIER
+    why = "it harms" if own.error >= found.alone else "a push grows" if own.admitted else "it is refused"
+    says = why + BEST if not right else (RESERVE if calm else BUSIER) * poor
     if own.turned:  # also where a turned gain works
         return Fact(Verdict.NO, numbers, of, f"{own.turned}.")
     if verdict != Verdict.YES and best in (0.0, 1.0):
@@ -414,8 +404,6 @@ QUESTIONS = (
              "limits.", "model", "problem"),
     Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns, "{jumps} of {of}", "Unwrap "
              "the angle that jumps by a whole turn, or weigh 1 - cos of its error.", of="problem"),
-    Question("posed", "Has the reference finite commands?", _posed, "by the model in {share_finite:%} of the cycles", "Give it the "
-             "derivatives that the plant's order needs, away from singular states.", "model", "problem"),
     Question("noiseless", "Has what is derived from a noisy or rounded quantity its noise, too?", _noiseless, "none is stated of "
              "{of}", "State what computes it from the samples: Sensing(sensors, SavitzkyGolay(15, degree=2)).", of="problem"),
     Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} did not converge| the relative error is {error:%}| "
@@ -425,7 +413,7 @@ QUESTIONS = (
              "{at_a_limit:%} of the cycles| in {at_a_limit_without_noise:%} without noise| the reference needs {needed_least} to "
              "{needed_most:u} of {of}| and its limits are {lower} to {upper:u}", "", "model gain rate weight estimator "
              "prediction limits speed"),
-    Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}" + BEST, "No gain that was run "
+    Question("gain", "Is the gain admissible?", recommended_gain, "it converges and helps" + BEST, "No gain that was run "
              "helps, is calm, and has reserve.", "model filter form lag prediction estimator sensors no_adaptation", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "the rms error of {of} is {rms_error:u}| {error:%} of its "
              "motion, {size:u}| in the mean {mean_error:u}", "", "residual_time deviation model gain lag no_adaptation rate weight "
@@ -435,7 +423,7 @@ QUESTIONS = (
     Question("horizon", "Is the horizon long enough?", _horizon, "the relative error is {error:%}| "
              "{error_with_twice_the_horizon:%} with twice the stages", ""),
     Question("box", "Does it come back for every plant in the range of the parameters?", _box, "it is lost on {of}",
-             "Identify the parameters better.", "gain rate limits no_adaptation", of="loop"),
+             "Identify the parameters better.", "gain rate weight limits no_adaptation", of="loop"),
     Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it bears {least} to {most} times "
              "their gain", "", "gain form rate weight estimator", of="loop"),
     Question("latency", "Does it bear a cycle of delay that nobody stated?", _latency, "it bears {bears} cycles, run with up "

@@ -130,7 +130,7 @@ def reviewed() -> Any:
 
 
 # The problem, its plant and limits, the controllers and the ranges of the tuning; and results.
-MADE = [(lambda: tasks.two_mass, 12), (measured, 20), (stepped, 3), (reviewed, 8)]
+MADE = [(lambda: tasks.two_mass, 12), (measured, 20), (stepped, 3), (reviewed, 7)]
 
 
 @pytest.mark.parametrize(("made", "least"), MADE)

@@ -61,19 +61,16 @@ def test_the_rate_that_is_named_is_the_one_that_passes():
     two, one = (fp.ComputedTorque(fp.Exponential(rate, integral=False)) for rate in (2.0, 0.5))
     told, vain = (answers(lift(), rate)["input_limits"].change for rate in (two, one))
     assert told == "Set the rate of the tracking law to 8."
-    assert vain.startswith("None of the changes that were run helps, 7 in all: rate, limits, speed (rate 0.25, 1, ")
+    assert vain.startswith("None of the changes that were run helps, 6 in all: rate, speed (rate 0.25, 1, ")
 
 
-@pytest.mark.parametrize("wrong", ["model", "reality", "both", "map"])
+@pytest.mark.parametrize("wrong", ["model", "reality", "map"])
 def test_a_wrong_sign_is_called_so(wrong):
-    """Of the model's parameter, of what moves, of an input that is positive, and of the map's gain."""
+    """Of the model's parameter, of what moves, and of the map's gain."""
     problem, own = motor(-1.6 if wrong == "model" else 1.6), fp.ComputedTorque(fp.Exponential(8.0))
     if wrong == "reality":
         real = replace(problem.plant, response=lambda q, v, u, p: {"q": -p.gain * u.V - 2 * v.q})
         problem = replace(problem, reality=fp.Reality(real))
-    if wrong == "both":
-        cooled = replace(heater().plant, response=lambda x, u, p: {"T": -u.u - p.a * x.T})
-        problem = replace(heater(), plant=cooled, reference=fp.Trajectory(lambda t: {"T": 2 + ca.sin(t)}))
     found = answers(problem, law(0.5) if wrong == "map" else own)
     bad = {a.change for a in found.values() if a.verdict in ("caution", "no")}
     assert [" sign" in one for one in bad] == [True] * (1 + (wrong == "model"))  # which the problem has, too
@@ -111,31 +108,50 @@ def test_limits_are_named_where_a_push_is_lost_at_them():
     """It comes back from a tenth of its range alone with a larger force."""
     found = answers(pushed_away(0.2505), fp.ComputedTorque(fp.Exponential(rate=3.0)))
     assert found["returns"].numbers["at_a_limit"] > 0.2 > found["input_limits"].numbers["at_a_limit"]
-    assert found["returns"].change.endswith('the limits of the inputs: Limits(inputs={"u": (-0.501, 0.501)}).')
-    assert answers(pushed_away(0.501), fp.ComputedTorque(fp.Exponential(rate=3.0)))["returns"].verdict == "yes"
+    [force] = re.findall(r'Widen the limits of the inputs: Limits.*"u": \(-\S+, (\S+)\)}\)\.$', found["returns"].change)
+    assert answers(pushed_away(float(force)), fp.ComputedTorque(fp.Exponential(rate=3.0)))["returns"].verdict == "yes"
 
 
 def test_the_worked_review_of_the_page_is_what_the_command_prints(tmp_path: Path, monkeypatch, capsys):
     """From no to yes: what is advised is set, and nothing is left to do; --verbose has the rows that are yes."""
     page = (Path(__file__).parents[2] / "docs" / "review.md").read_text()
-    [shown] = re.findall(r"```text\n(RHC.*?)```", page, re.DOTALL)
+    shown = re.findall(r"```text\n(RHC.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     assert main(["new", "my_plant"]) == 0
     text, told = Path("my_plant.py").read_text(), []
-    for code, gain, options in ((1, "1.0", []), (0, "-1", []), (0, "-1", ["--verbose"])):
+    for code, gain, options in ((1, "1.0", []), (0, "-0.05", []), (0, "-1", []), (0, "-1", ["--verbose"])):
         Path("my_plant.py").write_text(text.replace("gain=-1.0", f"gain={gain}"))
         assert main(["review", "my_plant.py", "-c", "RHC+FPI", *options]) == code
         told.append(" ".join(capsys.readouterr().out.split()))
-    assert re.search(".*".join(re.escape(" ".join(part.split())) for part in shown.split("...")), told[0])
-    counts = told[0].count("->"), told[1].count("->"), told[2].count("yes Do"), told[1].count("recommended gain: -1 ")
-    assert counts == (2, 0, 7, 1)
+    for text, one in zip(shown, told, strict=False):
+        assert re.search(".*".join(re.escape(" ".join(part.split())) for part in text.split("...")), one)
+    counts = told[0].count("->"), told[2].count("->"), told[3].count("yes Do"), told[2].count("recommended gain: -1 ")
+    assert (len(shown), *counts) == (2, 2, 0, 7, 1)
 
 
-def test_rows_of_one_controller_agree_on_its_gain():
-    """By itself one row would lower the gain and another leave adaptation out, which mends both."""
-    plan = {"horizon": fp.Horizon(15, 2e-2), "cost": fp.Quadratic({"q": 1e2, "q'": 1.0}, deviation={"u": 1e-2})}
-    ends = fp.Limits(inputs={"u": (-30.0, 30.0)}, states={"q'": (-1.0, 1.0)}, prices={"q'": 1e4})
-    fast = {"reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(5 * t)}), "start": {"q": 0.3}, "period": 5e-3}
-    own = fp.RecedingHorizon(fp.FixedPointSolver(), fp.ModelReferenced(fp.Sigmoid(-1.0)))
-    told = answers(mass(limits=ends, measure_from=1.0, **plan, **fast), own)
-    assert {told[key].change for key in ("follows", "pays")} == {"Leave the deformation out."}
+def test_a_swing_that_grows_until_limits_hold_it_is_a_no_and_a_shorter_window_mends_it():
+    seen = fp.Sensing({"q": fp.Sensor(fp.Noise(3e-5))}, fp.SavitzkyGolay(79, 2))
+    told = answers(motor(1.0, sensing=seen), fp.ComputedTorque(fp.Exponential(8.0)))["returns"]
+    assert (told.verdict, told.change[:43]) == ("no", "Take the estimator SavitzkyGolay(window=39,")
+
+
+def test_a_window_that_harms_another_controller_is_named_with_its_harm():
+    problem = motor(1.0, sensing=fp.Sensing({"q": fp.Sensor(noise=fp.Noise(2e-4))}, fp.SavitzkyGolay(5, 2)))
+    laws = {name: fp.ComputedTorque(fp.Exponential(rate)) for name, rate in (("slow", 8.0), ("fast", 40.0))}
+    told = {a.key: a for a in fp.review(problem, laws, mismatch=0.0, seed=0).answers["slow"]}["noise"].change
+    assert re.match(r"Take the estimator SavitzkyGolay\(window=41, degree=2\)\..* But fast then gets a ", told)
+
+
+def test_limits_that_are_too_small_are_one_row_of_the_problem():
+    laws = {name: fp.ComputedTorque(fp.Exponential(rate)) for name, rate in (("slow", 3.0), ("fast", 6.0))}
+    wave, ends = fp.Trajectory(lambda t: {"T": 2 + 1.6 * ca.sin(0.5 * t)}), fp.Limits({"u": (0.0, 2.0)})
+    problem = replace(heater(), reference=wave, start={"T": 2.0}, duration=20.0, measure_from=3.0, limits=ends)
+    found = fp.review(problem, laws, mismatch=0.0, seed=0).answers
+    [cause] = found["problem"]
+    assert (cause.key, cause.verdict) == ("input_limits", "no")
+    assert {a.change for name in laws for a in found[name] if a.verdict in ("no", "caution")} == {cause.change}
+
+
+def test_a_reality_with_more_states_is_no_exact_model_which_is_unknown():
+    [told] = answers(behind_an_actuator(0.4), fp.ExactModel(law(-1.5))).values()
+    assert (told.verdict, told.change[-20:]) == ("unknown", "leave ExactModel out")

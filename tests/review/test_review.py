@@ -3,9 +3,7 @@
 import json
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,18 +23,6 @@ def test_a_limit_that_is_left_has_the_numbers_of_the_run():
     worst, most = int(speed.argmax()), speed.max() - 1
     wanted = {"excess": most, "beyond": most / 2, "time_of_it": worst * PERIOD, "share_of_cycles": np.mean(speed > 1)}
     assert answers(fast)["limits"].numbers == pytest.approx(wanted, rel=5e-3)
-
-
-def test_an_interrupted_review_tells_what_it_knows():
-    """That it was interrupted is a no, and its answers are those of the whole one, of which advice is told row by row."""
-    asked, seen = partial(fp.review, mass(), {"it": torque(gain=-40.0)}, mismatch=0.0, seed=0), Mock()
-    whole, told = asked(progress=seen).answers["it"], [call.args for call in seen.call_args_list]
-    bad = sum(a.verdict in ("no", "caution") for a in whole)
-    assert told[-1] == ("trying advice for it", bad, bad)
-    before = told.index(("trying advice for it", 0, bad))
-    part = asked(progress=Mock(side_effect=[None] * before + [KeyboardInterrupt])).answers
-    assert [a.key for a in part["problem"] if a.verdict == "no"] == ["finished"]
-    assert [(a.key, a.verdict) for a in part["it"]] == [(a.key, a.verdict) for a in whole]
 
 
 def test_a_start_and_a_reference_outside_hard_limits_are_named_first_and_as_the_cause():
