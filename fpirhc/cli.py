@@ -43,7 +43,7 @@ def _publish(view: Any, page: str, folder: Path, as_json: bool, verbose: bool) -
 )
 def compare(
     problem: opt.Problem, controllers: opt.Controllers = None, set_: opt.Set = None,
-    plans: Annotated[bool, typer.Option("--plans", help="solve and certify the first plans alone; no run")] = False,
+    plans: Annotated[bool, typer.Option("--plans", help="certify the first plan of every controller, and run none")] = False,
     seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False, json: opt.Json = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip

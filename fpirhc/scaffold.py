@@ -80,7 +80,7 @@ import fpirhc as fp
 def response(q, v, u, p):
     """Highest derivative of every coordinate, from the lower ones (q, v), the inputs (u) and the parameters (p), all by name.
 
-    Write functions of CasADi (ca.sin, ca.exp, ...): those of math cannot act on a symbol, those of numpy often can, with a warning.
+    Write functions of CasADi (ca.sin, ca.exp, ...): those of math cannot act on a symbol, and some of numpy cannot.
     Take every parameter from p: the controller computes with its approximate value, the simulated plant with the exact one. A plant
     of order 1, such as a tank or a heater, has no velocities: response(q, u, p).
     """

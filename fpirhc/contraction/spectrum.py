@@ -198,7 +198,7 @@ def assess_gain(
     )
     if not np.isclose(ends[0], ends[1]):
         converging += f", and below {written_out(ends[1])} to converge from errors of any size"
-    behind = f", without the response's delay of {number(late)} cycles" if late else ""
+    behind = f" (if the response came at once; it is {number(late)} cycles late)" if late else ""
     text = f"{what} leaves at most {written_out(predicted)} of an error of the request per cycle{behind}"
     if not sector[0] < gain < sector[1]:
         text += ", but only a small one: beyond the sector limit large errors may end in a bounded oscillation"

@@ -17,6 +17,7 @@ import numpy as np
 from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.chain import nominal_responses
+from fpirhc.summary import written_out
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import pairs
@@ -89,6 +90,16 @@ def needed_commands(problem: Problem, run: np.ndarray, *, exact: bool = False) -
     given = plant.exact if exact else plant.approximate
     [table] = Evaluator(plant.equations.inverse.map(count))(states, responses, np.tile(given, (count, 1)))
     return table.reshape(count, -1)
+
+
+def beyond_limits(problem: Problem) -> list[str]:
+    """Return a sentence where the reference needs more of an input, of the plant where it is known, than its limits give."""
+    plant, ends = problem.plant, np.abs(problem.limits.input_bounds(problem.plant)).max(axis=0)
+    states, known = np.full((problem.cycles, plant.state.size), np.nan), problem.reality is None
+    asked = np.abs(needed_commands(problem, states, exact=known and problem.moves.simulated)).max(axis=0)
+    needed = {name: one / end for name, one, end in zip(plant.inputs, asked, ends, strict=True) if one > end > 0}
+    said = "The reference needs {} times the limits of {}: widen them, or ask for less."
+    return [said.format(written_out(times), name) for name, times in needed.items() if times < math.inf]
 
 
 def largest_response(problem: Problem) -> tuple[float, ...]:

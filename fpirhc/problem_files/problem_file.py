@@ -127,7 +127,8 @@ def load_problem(name_or_path: str | Path) -> Task:
     return Task(path.stem, path, title, description.strip("\n"), **facts)
 
 
-_NEEDED = {"problem": "fpirhc.Problem(...)", "controllers": "{'name': fpirhc.ComputedTorque(...), ...}"}
+_RHC = "{'RHC': fpirhc.RecedingHorizon(fpirhc.FixedPointSolver()), ...}"
+_NEEDED = {"problem": "fpirhc.Problem(...)", "controllers": _RHC}
 _KINDS = {
     "problem": expected_by(Problem),
     "controllers": expected_by(Mapping[str, Controller]),

@@ -105,9 +105,7 @@ def show_brief(table: Table, console: Console | None = None) -> None:
         else:
             more.append(table.columns[k].head)
     show_table(replace(table.of([*range(table.names), *kept]), caption=""), console) if kept else None
-    if more:
-        below.append(f"more columns by --verbose: {', '.join(more)}")
-    for text in below:
+    for text in [*below, *[f"more columns by --verbose: {', '.join(more)}"] * bool(more)]:
         say(text)
 
 

@@ -102,10 +102,10 @@ def to_json(facts: Mapping[str, Any]) -> str:
 
 
 def status_shares(statuses: Mapping[str, int]) -> str:
-    """The shares of cycles whose status is not ok, such as 'not converged 1.67 %'."""
-    cycles = sum(statuses.values())
-    other = {name: count for name, count in statuses.items() if count and name != "OK"}
-    return ", ".join(f"{k.lower().replace('_', ' ')} {in_percent(v / cycles)}" for k, v in other.items())
+    """The shares of cycles whose status is not ok, such as 'not converged in 1.67 % of the cycles'."""
+    cycles, words = sum(statuses.values()), {"HELD": "plan failed"}
+    other = {words.get(k, k.lower().replace("_", " ")): v for k, v in statuses.items() if v and k != "OK"}
+    return ", ".join(f"{what} in {in_percent(v / cycles)} of the cycles" for what, v in other.items())
 
 
 def finite_alone(value: Any) -> Any:

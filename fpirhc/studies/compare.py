@@ -16,6 +16,7 @@ from fpirhc.contraction.spectrum import ContractionReport, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.reference_states import beyond_limits
 from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -58,8 +59,8 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
         try:
             checked(task.problem, controller)
         except NotContractive as error:
-            best = recommended_for(task.problem, controller)
-            told = " ".join([*_slips(task.problem), f"{error}{best and f'. {best}'}"])
+            best, slipped = recommended_for(task.problem, controller), _slips(task.problem)
+            told = " ".join([*slipped, *[f"{error}{best and f'. {best}'}"] * (not (slipped and error.turned))])
             owners.setdefault(told, []).append(f"'{name}'")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
@@ -189,8 +190,8 @@ class Comparison(Study):
         else:
             said = ["does not follow"] * (entry.name in self.lost) + [status_shares(entry.metrics.statuses)]
             said += [s for s, _ in self._yard.shortfalls(entry, not said[0] and self.task.headline_metric is None)]
-        said += [f"late {in_percent(late)}" for late in entry.cycle[3:] if late > LATE]
-        said += [f"leaves {', '.join(one.name for one in entry.left)}"] * bool(entry.left)
+        said += [f"late in {in_percent(late)} of the cycles" for late in entry.cycle[3:] if late > LATE]
+        said += [f"limit of {', '.join(one.name for one in entry.left)} violated"] * bool(entry.left)
         return ", ".join(filter(None, said)) or "ok"
 
     def _facts(self) -> dict[str, Any]:
@@ -257,7 +258,7 @@ def _causes(problem: Problem, entries: Sequence[Entry], yard: Yardstick) -> list
     """What the file itself says of loops that do not follow, or leave a limit."""
     placed = [f"{text[0].upper()}{text[1:]}." for text in misplaced(problem)]
     lost = any(not e.adaptive and (not follows(e, yard) or yard.shortfalls(e, True)) for e in entries)
-    return placed + lost * _slips(problem)
+    return [*placed, *(_slips(problem) or beyond_limits(problem) if lost else [])]
 
 
 def _slips(problem: Problem) -> list[str]:

@@ -166,7 +166,7 @@ class Margins(Study):
                 borne.setdefault(row.quantity, [*self.beats[row.quantity]]).append(f"{row.controller} fails {where}")
         grows = " ".join(f"{name.capitalize()}: {QUANTITIES[name][1]}." for name in dict.fromkeys(self.table.quantity))
         about = (
-            f"One quantity grows until a run fails; the margin is found to 5 %. {grows} A run fails if it ends early, leaves a "
+            f"One quantity grows until a run fails; the margin is found to 5 %. {grows} A run fails if it ends early, violates a "
             f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
             "reference's range. What holds may have a large error. A controller beats its partner where its error is a tenth "
             "smaller, and its command neither chatters nor stands at limits."

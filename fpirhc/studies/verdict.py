@@ -130,8 +130,8 @@ class Outcome(StrEnum):
     DOUBTFUL = "doubtful"  # a smaller error, and a reason why it is no success
     NO_DIFFERENCE = "no difference"
     NOT_COMPARABLE = "not comparable"
-    LIMIT_LEFT = "hard limit left"  # of whatever error
-    LEAVES = "leaves a limit"  # of controllers, and of no pair
+    LIMIT_LEFT = "violates a hard limit"  # of whatever error
+    LEAVES = "violates a limit"  # of controllers, and of no pair
     NOT_GOOD = "not good yet"  # of one controller, whatever it is compared with
 
 
@@ -150,6 +150,7 @@ class Finding:
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
+NEAR = 1.2  # times the smallest error, below which another controller is named beside the best one
 STILL = 1e-5  # of the limits' range, or of the rms command, in a cycle: what moves less stands still
 WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own range: chatter
 UNSOLVED = 0.05  # of the plans
@@ -198,15 +199,13 @@ class Yardstick:
     scales: Mapping[str, float]  # the ranges
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
     resting: Mapping[str, float]  # the set-point's size of what rests; under disturbances, of the movement left alone
-    span: str  # of time in which errors count
 
     @staticmethod
     def of(problem: Problem, seed: int) -> Yardstick:
         """Return the yardstick of a problem."""
         (scales, sizes), alone = ranges(problem), left_alone(problem, seed)
         resting = {n: max(s, alone.get(n, s)) if problem.disturbances or not s else s for n, s in sizes.items()}
-        span = f"t = {number(problem.measure_from)} to {number(problem.duration)}{with_space(problem.time_unit)}"
-        return Yardstick(problem, scales, alone, resting, span)
+        return Yardstick(problem, scales, alone, resting)
 
     def beyond(self, entry: Entry, name: str) -> bool:
         """Whether an error is larger than the motion itself, and than what stands for it where nothing is to move."""
@@ -220,7 +219,7 @@ class Yardstick:
         shares = self._remains(entry) if by_error else 0.0, entry.metrics["at_limit"][""]
         error, stands = map(in_percent, shares)
         far = f"errs {error}", f"still errs by {error} of the motion in the second half"
-        stuck = f"at a limit {stands}", f"stands at a limit in {stands} of the cycles"
+        stuck = f"at a limit in {stands} of the cycles", f"stands at a limit in {stands} of the cycles"
         return [far] * (REMAINS < shares[0] < math.inf) + [stuck] * (shares[1] > AT_LIMITS)
 
     def _remains(self, entry: Entry) -> float:
@@ -395,10 +394,11 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
         outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
         outcome = Outcome.DOUBTFUL
-    outcome = Outcome.LIMIT_LEFT if adaptive.left else outcome
     units = {n: with_space(run.unit(f"error.{n}")) for n in ratios}
     errors = ", ".join(f"{n} {written_out(before[n])} -> {written_out(after[n])}{unit}" for n, unit in units.items())
-    text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'}, {yard.span})."
+    broken = f"violates the hard limit of {adaptive.left[0].name}" if adaptive.left else ""
+    outcome = Outcome.LIMIT_LEFT if broken else outcome
+    text = f"{names[1]} against {names[0]}: {broken or outcome} (rms error {errors or 'of rounding'})."
     more = " ".join(f"{s[0].upper()}{s[1:]}." for s in said)
     return Finding(f"{text} {more}".rstrip(), outcome, names, ratios, more if outcome is Outcome.BETTER else "")
 
@@ -422,18 +422,20 @@ def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
         outcome = Outcome.NO_DIFFERENCE
     else:
         outcome = Outcome.BETTER if aim.sign * after < aim.sign * before else Outcome.WORSE
-    outcome = Outcome.LIMIT_LEFT if adaptive.left else outcome
-    text = f"{names[1]} against {names[0]} by {aim.column}: {outcome} ({aim.text(before)} -> {aim.text(after)})."
+    broken = f"violates the hard limit of {adaptive.left[0].name}" if adaptive.left else ""
+    outcome = Outcome.LIMIT_LEFT if broken else outcome
+    change = f"{aim.text(before)} -> {aim.text(after)}"
+    text = f"{names[1]} against {names[0]} by {aim.column}: {broken or outcome} ({change})."
     return Finding(text, outcome, names, {aim.column: ratio})
 
 
 def leaves(entries: Sequence[Entry]) -> str:
-    """Return who leaves a hard limit, of several the worst: every limit once, with all names and the worst number."""
+    """Return who violates a hard limit, of several the worst: every limit once, with all names and the worst number."""
     worst, said = {e.name: e.left[0] for e in entries if e.left}, list[str]()
     for limit in dict.fromkeys(one.name for one in worst.values()):
         names = sorted((n for n in worst if worst[n].name == limit), key=lambda n: -worst[n].beyond.max())
         one, whose = len(names) == 1, f" of {names[0]}"
-        said.append(f"{', '.join(names)} leave{'s' * one} a limit: {worst[names[0]].sentence}{'' if one else whose}.")
+        said.append(f"{', '.join(names)} violate{'s' * one} a limit: {worst[names[0]].sentence}{'' if one else whose}.")
     return " ".join(said)
 
 
@@ -453,7 +455,7 @@ def findings(
     judged[0] = replace(first, text=" ".join([*causes, *[left] * own, first.text.removesuffix(first.price).rstrip()]))
     judged += [Finding(left, Outcome.LEAVES)] * bool(left and not own)
     judged[1:1] = [*_not_good(first, by_name, yard, aim.metric is None), *[Finding(first.price)] * bool(first.price)]
-    judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
+    judged += [Finding(text) for text in _remarks(entries, pairs[0][1] if pairs else None, yard, bool(causes))]
     return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
 
 
@@ -480,12 +482,14 @@ def relative(errors: Mapping[str, float], sizes: Mapping[str, float]) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yard: Yardstick) -> Iterator[str]:
-    names = (pairs[0][1].weighed if pairs else None) or [*yard.scales]
+def _remarks(entries: Sequence[Entry], first: Entry | None, yard: Yardstick, told: bool) -> Iterator[str]:
+    names = (first.weighed if first else None) or [*yard.scales]
     rows = {e.name: relative({n: e.errors[n] for n in names}, yard.scales) for e in entries if e.run.stop is None}
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows.get(e.name, math.inf))}
-    if fair:
-        least, best = min((v, n) for n, v in fair.items())
+    if fair and not any(follows(e, yard) for e in entries):
+        yield f"No controller follows{'' if told else '; fpirhc review says why'}."
+    elif fair and not (first and len(fair) == len(entries) == 2):  # the sentence of the only pair has both errors
+        (least, best), *rest = sorted((v, n) for n, v in fair.items())
         among = " with the wrong model" * any(e.exact for e in entries)
-        text = f"Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
-        yield text if any(follows(e, yard) for e in entries) else "No controller follows; fpirhc review says why."
+        others = "".join(f"; {n} is within {math.ceil(100 * (v / least - 1))} %" for v, n in rest if v < NEAR * least)
+        yield f"Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference{others}."

@@ -68,7 +68,7 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
 
 def meant(paths: Iterable[str]) -> str:
     """Return ' Did you mean 'a' or 'b'?' of paths; empty where there are none."""
-    quoted = " or ".join(f"'{one}'" for one in paths)
+    quoted = " or ".join(f"'{one.replace('.map.', '.')}'" for one in paths)  # a path passes through wrappers by itself
     return f" Did you mean {quoted}?" if quoted else ""
 
 

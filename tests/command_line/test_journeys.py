@@ -136,7 +136,7 @@ JOURNEYS: dict[str, list[tuple[Any, ...]]] = {
         (of_whole_file, "compare line.py --no-compile -c CTC", 0, MASS, "results/line/part/report.html"),
         (of_whole_file, "compare line.py --no-compile", 0, f"{MASS}\n- CTC+FPI against CTC: better"),
     ],
-    "left": [(FAST, "compare line.py --no-compile -c CTC", 0, f"{MASS}\n- The reference of", "- CTC leaves a limit: y'")],
+    "left": [(FAST, "compare line.py --no-compile -c CTC", 0, f"{MASS}\n- The reference of", "- CTC violates a limit: y'")],
     "interrupted": [(INTERRUPTED, "compare line.py --no-compile", 130, MASS, "CTC+FPI (interrupted before it finished)")],
     "plans": [
         (None, "compare line.py --no-compile -c CTC --set exact.b=1e-3", 1, MASS),  # it does not follow

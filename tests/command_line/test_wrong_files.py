@@ -241,7 +241,7 @@ study mine.py --draws 2 --mismatch x => expected percent of at least 0, such as 
 study mine.py --margins noise --mismatch 20 => --mismatch is of drawn plants: give --draws N too
 review mine.py --mismatch 120% => mismatch 120 %: use at least 0 % and less than 100 %, where no parameter changes its sign
 run mine.py fpi => controller 'fpi' is unknown. Did you mean 'RHC+FPI'?
-compare mine.py --set gain=-2 => has no 'gain'. Did you mean 'optimiser.map.gain' or 'deformation.map.gain'?
+compare mine.py --set gain=-2 => has no 'gain'. Did you mean 'optimiser.gain' or 'deformation.gain'?
 run mine.py RHC --set mass=2 => write exact.mass for the plant, approximate.mass for the model
 new ../my-arm => '../my-arm' is no name for a problem ... Try 'my_arm'; a folder is given by --dir
 new two_mass => 'two_mass' cannot be the name of a problem: a shipped problem has it ... Try 'my_two_mass'
@@ -255,7 +255,7 @@ study mine.py --over deformation.map.gain=1:2 => expected PATH=LOW:HIGH:COUNT
 study mine.py --over deformation.map.gian=1:2:3 => has no 'gian'. Did you mean 'gain'?
 run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number other than zero ... got nan
 run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
-compare mine.py --set exact.mass=-1 => In the model mass is -1.4 times the plant's. ... differ in sign: ... the plant's sign
+compare mine.py --set exact.mass=-1 => In the model mass is -1.4 times the plant's. Mend mass of the model: is it a slip of sign?
 run mine.py RHC --set period=5 => or a period of ... is 5 ms meant?
 run mine.py RHC --set dead_time.measurement=50 => more than 1000 control cycles ... is one of the two in ms?
 run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file

@@ -98,7 +98,7 @@ PAGES = {
         ends={"y": ("m", []), "command u": ("N", [-20.0, None]), "y'": ("m/s", [-4.0, 5.0])}),
     "left": Page(
         partial(compared, "plain", limits=fp.Limits(states={"y'": (-1.0, 1.0)})),
-        ["<tr class='red'><th scope='row'>plain</th>", "class='outcome-leaves-a-limit'>plain leaves a limit: y&#39; reach"]),
+        ["<tr class='red'><th scope='row'>plain</th>", "class='outcome-violates-a-limit'>plain violates a limit: y&#39; reach"]),
     "ended": Page(ended, ["does not finish: signal &#39;x&#39; is not finite", "<td class='none'>none</td>"]),
     "empty": Page(lambda: replace(compared("plain"), entries=(), skipped={"x": "because"}), ["No controller finished"]),
     "days": Page(daily, [r"\[day\]"], [SECONDS]),

@@ -17,7 +17,6 @@ const tone = (color) => (color === "#111111" ? ink : color);
 const colors = Object.fromEntries(DATA.controllers.map((c) => [c.name, tone(c.color)]));
 const faint = styles.getPropertyValue("--line").trim();
 const shown = new Set(DATA.controllers.map((c) => c.name));
-const sync = uPlot.sync("time");
 const plots = [];
 let zooming = false;
 
@@ -68,42 +67,33 @@ function point(time) {
   for (const { chart, box } of plots) if (!box.hidden) chart.setCursor({ left: chart.valToPos(time, "x"), top: -10 }, false);
 }
 
+const element = (tag, content) => Object.assign(document.createElement(tag), content);
+
 // All boxes stand in the grid before a chart is drawn: a box that is alone in it is as wide as the page.
 function place(spec) {
-  const box = document.createElement("div");
-  box.className = "chart";
-  const title = document.createElement("h3");
   const [low, high] = spec.limits ?? [];
   const bounded = (low ?? high ?? null) === null ? "" : `, limits ${low ?? "-∞"} to ${high ?? "∞"}`;
-  title.textContent = `${spec.title} [${spec.unit}]${bounded}`;
-  box.append(title);
+  const box = element("div", { className: "chart" });
+  box.append(element("h3", { textContent: `${spec.title} [${spec.unit}]${bounded}` }));
   document.getElementById(spec.only ? "responses" : spec.real ? "reality" : "charts").append(box);
   return { box, spec };
 }
 
 function draw({ box, spec }) {
   const label = "t [" + DATA.timeUnit + "]";
-  const series = [{ label }].concat(
-    spec.series.map((s) => {
-      const [color, width, dash] = LINES[s.name] || [null, 1.2];
-      return {
-        label: s.name,
-        stroke: colors[s.name] || color || ink,
-        width,
-        dash,
-        points: { show: s.values.filter((v) => v !== null).length === 1, size: 9, fill: colors[s.name] }, // a value alone is a dot
-        value: (_, v) => (v === null || v === undefined ? "" : numberText(v)),
-      };
-    })
-  );
+  const line = (s) => {
+    const [color, width, dash] = LINES[s.name] || [null, 1.2];
+    const points = { show: s.values.filter((v) => v !== null).length === 1, size: 9, fill: colors[s.name] }; // a value alone is a dot
+    const value = (_, v) => (v === null || v === undefined ? "" : numberText(v));
+    return { label: s.name, stroke: colors[s.name] || color || ink, width, dash, points, value };
+  };
+  const series = [{ label }, ...spec.series.map(line)];
   const axis = { stroke: ink, grid: { stroke: faint, width: 1 }, ticks: { stroke: faint, width: 1 } };
   const options = {
-    width: box.clientWidth,
-    height: HEIGHT,
-    series,
+    width: box.clientWidth, height: HEIGHT, series,
     scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec), spec.limits) } },
     axes: [{ ...axis, ...labelled, values: AXIS_OF_VALUES.values, label }, { ...axis, ...AXIS_OF_VALUES }],
-    cursor: { sync: { key: sync.key } },
+    cursor: { sync: { key: "time" } },
     legend: { markers: { dash: (_, k) => (series[k].label === "set-point" ? "dotted" : series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
     hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => limits(chart, spec)] },
   };
@@ -112,12 +102,10 @@ function draw({ box, spec }) {
 }
 
 // A chart is as wide as its box, also after the box was hidden. The next frame, because a new size inside the callback starts it anew.
-function fit() {
-  requestAnimationFrame(() => {
-    for (const { chart, box } of plots)
-      if (box.clientWidth && box.clientWidth !== chart.width) chart.setSize({ width: box.clientWidth, height: HEIGHT });
-  });
-}
+const fit = () => requestAnimationFrame(() => {
+  for (const { chart, box } of plots)
+    if (box.clientWidth && box.clientWidth !== chart.width) chart.setSize({ width: box.clientWidth, height: HEIGHT });
+});
 
 function show() {
   for (const { chart, box, spec } of plots) {
@@ -127,16 +115,12 @@ function show() {
 }
 
 function control(controller) {
-  const label = document.createElement("label");
-  const box = document.createElement("input");
-  box.type = "checkbox";
-  box.checked = true;
+  const label = element("label"), box = element("input", { type: "checkbox", checked: true });
   box.addEventListener("change", () => {
     box.checked ? shown.add(controller.name) : shown.delete(controller.name);
     show();
   });
-  const swatch = document.createElement("span");
-  swatch.className = "swatch";
+  const swatch = element("span", { className: "swatch" });
   swatch.style.background = colors[controller.name];
   label.append(box, swatch, document.createTextNode(controller.name));
   document.getElementById("controllers").append(label);
@@ -153,10 +137,7 @@ DATA.charts.map(place).forEach(draw);
 // Begin with the controllers of the verdict's first sentence, so that a diverged one does not set every scale.
 if (DATA.begin.length) {
   shown.clear();
-  for (const b of boxes) {
-    b.box.checked = DATA.begin.includes(b.name);
-    if (b.box.checked) shown.add(b.name);
-  }
+  for (const { box, name } of boxes) if ((box.checked = DATA.begin.includes(name))) shown.add(name);
 }
 show();
 const observer = new ResizeObserver(fit);
