@@ -4,7 +4,7 @@ const HEIGHT = 220; // of a chart, px
 const labelled = { size: 30, labelSize: 18, labelGap: 0, labelFont: "12px system-ui,sans-serif" };
 // Color, width and dashes of lines that are no controller's; those drawn later lie above.
 const LINES = {
-  realised: ["#d55e0099", 3],
+  realised: ["#d55e0055", 3],
   deformed: ["#e69f00", 1.2, [6, 3]],
   desired: ["#0072b2", 1.2],
   nominal: ["#009e73", 1.6, [2, 4]],
