@@ -286,9 +286,9 @@ def _noise(case: Case) -> Fact | None:
     steps = np.diff((noisy["command"][:count] - quiet["command"][:count])[bench.first(count) :], axis=0)
     size = np.sqrt((steps**2).mean(axis=0))
     worst = int((size / bench.span).argmax())
-    step, (moves, quietly) = size[worst] / bench.span[worst], (bench.moves(run)[worst] for run in (noisy, quiet))
-    numbers = {"rms_change": size[worst], "rms_step": step, "movement": moves, "movement_without_noise": quietly}
-    verdict = Verdict.CAUTION if step > CHATTER and moves > BUSY * quietly else Verdict.YES
+    step, (moves, calm) = size[worst] / bench.span[worst], (bench.moves(run)[worst] for run in (noisy, quiet))
+    numbers = {"rms_step": step, "times": moves / max(calm, TINY), "movement": moves, "movement_without_noise": calm}
+    verdict = Verdict.CAUTION if step > CHATTER and moves > BUSY * calm else Verdict.YES
     return Fact(verdict, numbers, list(case.problem.plant.inputs)[worst])
 
 
@@ -350,7 +350,8 @@ def gain_by_run(case: Case) -> Fact:
     if not right:
         verdict = Verdict.NO if best or found.alone <= GOOD else Verdict.UNKNOWN
     elif calm and ratio > (WORSE if reserve and not spare else LITTLE):
-        best = 1.0
+        less = best and case.problem.sensing.drawn and (rungs[best].moves <= LITTLE * own.moves).all()
+        best = best if less and not poor else 1.0
     why = "it harms" if own.error >= found.alone else "a push grows" if own.admitted else "it is refused"
     says = why + BEST if not right else (RESERVE if calm else BUSIER) * poor
     if own.turned:  # also where a turned gain works
@@ -435,9 +436,9 @@ QUESTIONS = (
              "weight speed"),
     Question("inner", "Are the zero dynamics stable?", _inner, "the largest real part is {rate_with_outputs_held} 1/{time}",
              "States without a task go off: weigh them in the cost, or control another output."),
-    Question("noise", "Is the movement from noise small?", _noise, "noise changes {of} by {rms_step:%} of its motion from cycle to "
-             "cycle| its total variation is {movement:r}| {movement_without_noise:r} without noise", "Measure the response with "
-             "less noise.", "model gain filter estimator rate weight"),
+    Question("noise", "Is the movement from noise small?", _noise, "noise makes {of} move {times} times as much| its "
+             "total variation is {movement:r}| {movement_without_noise:r} without noise", "Measure the response with less noise.",
+             "model gain filter estimator rate weight"),
     Question("model", "Would it do little harm if the model were right?", _model, "then, with the problem's sensors, the rms error "
              "of {of} is {error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides.", "form "
              "estimator gain filter no_adaptation", "adaptive"),

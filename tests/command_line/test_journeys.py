@@ -113,8 +113,8 @@ JOURNEYS: dict[str, list[tuple[Any, ...]]] = {
     "help": [(None, "", 0, "Usage: fpirhc"), (None, "help run", 0, "Usage: fpirhc run"), (None, "--version", 0, "fpirhc 0.")],
     "list": [(None, "list", 0, "first examples")],
     "review": [
-        (None, "review line.py -c CTC", 0, "problem: "),
-        (edited("exact=1.6", "exact=-1.6"), "review line.py", 1, "problem: "),
+        (None, "review line.py -c CTC", 0, "CTC: 5 of 5 yes"),
+        (edited("exact=1.6", "exact=-1.6"), "review line.py", 1, "problem"),
     ],
     "probe": [
         (None, "probe line.py --cycles 80 --no-trials", 0, "line: probe with CTC"),

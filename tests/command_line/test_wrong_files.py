@@ -130,7 +130,7 @@ class of another tool
     fpirhc has no name 'MPC'. Did you mean 'RecedingHorizon'? ... more.
 start outside the limits
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"torque": (-15.0, 15.0)}, states={"angle": (0.5, 2.5)})
-    no Do states, rates and paths keep their limits? ... A limit of angle is left ... by at most 0.5 rad
+    no Do start and reference keep the hard limits of states? ... The start of angle is 0 rad, outside its hard limits of 0.5
 gain of the wrong sign
   gain=-2.6 -> gain=2.6
     no Is the gain admissible? ... Set deformation.gain to -

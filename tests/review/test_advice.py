@@ -20,6 +20,19 @@ def test_a_refusal_names_another_gain_than_the_one_that_is_refused():
     assert re.search(r"use 0 < \|gain\| < 1\.76, .* Set deformation\.gain to -1\.125\.$", str(refused.value))
 
 
+@pytest.mark.parametrize("gain", [-0.125, -4.0])
+def test_the_recommended_gain_is_not_that_of_the_file(gain):
+    """Of gains whose errors differ by less than a tenth it is the one with which noise moves the command least."""
+    known = {"K": fp.Parameter(1.0, 0.7, "1/s"), "push": fp.Parameter(0.0, 0.5, "1")}
+    plant = fp.Plant({"q": "rad"}, {"u": "rad"}, known, lambda q, v, u, p: {"q": p.K * u.u - v.q + p.push})
+    compass = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(2e-4))}, fp.SavitzkyGolay(window=31, degree=2))
+    wave, ends = fp.Trajectory(lambda t: {"q": 0.4 * ca.sin(t)}), fp.Limits(inputs={"u": (-9.0, 9.0)})
+    shown = {"measure_from": 4.0, "limits": ends, "sensing": compass}
+    ship = fp.Problem(plant, wave, {"q": 0.0}, period=1e-2, duration=12.0, **shown)
+    own = fp.ComputedTorque(fp.Exponential(rate=3.0), fp.ModelReferenced(fp.Sigmoid(gain=gain)))
+    assert answers(ship, own)["gain"].numbers["recommended_gain"] == -1.0
+
+
 def test_a_lag_is_named_where_no_gain_helps():
     """An own run with the one that is named is nearer than with another, or without adaptation, and today's is the worst."""
     problem, own = behind_an_actuator(0.4), law(-1.5, 3.0)
