@@ -437,8 +437,8 @@ QUESTIONS = (
     Question("inner", "Are the zero dynamics stable?", _inner, "the largest real part is {rate_with_outputs_held} 1/{time}",
              "States without a task go off: weigh them in the cost, or control another output."),
     Question("noise", "Is the movement from noise small?", _noise, "noise moves {of} by {rms_step:%} of its motion in a "
-             "cycle| and makes it move {times} times as much: {movement:r}| {movement_without_noise:r} without noise", "Measure the "
-             "response with less noise.", "model gain filter estimator rate weight"),
+             "cycle| and makes it move {times} times as much: {movement:r}| {movement_without_noise:r} without noise", "Measure "
+             "the response with less noise.", "model gain filter estimator rate weight"),
     Question("model", "Would it do little harm if the model were right?", _model, "then, with the problem's sensors, the rms error "
              "of {of} is {error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides.", "form "
              "estimator gain filter no_adaptation", "adaptive"),
