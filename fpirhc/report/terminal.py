@@ -244,16 +244,21 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
     for name, answers in found.answers.items():
         shown = [one for one in answers if verbose or one.verdict != "yes"]
         told = [f"{len(answers) - len(shown)} of {len(answers)} yes"] * (len(shown) < len(answers))
-        told += [f"recommended gain: {number(g)}" for a in answers if (g := a.numbers.get("recommended_gain"))]
+        ready = all(one.verdict == "yes" for one in found.answers["problem"])  # a gain is for what comes first
+        uppermost = next((one.change for one in answers if one.verdict != "yes"), "")
+        fit = [a for a in answers if ready and (a.verdict == "yes" or a.change == uppermost)]
+        told += [f"recommended gain: {number(g)}" for a in fit if (g := a.numbers.get("recommended_gain"))]
         say(name, "bold", f": {', '.join(told)}" * bool(told)) if answers else None
         for change in dict.fromkeys(one.change for one in shown):  # once, below its rows
             rows = sorted((one for one in shown if one.change == change), key=lambda one: one.verdict != "no")
             above = name != "problem" and change in {one.change for one in found.answers["problem"] if change}
             brief = (above or (len(rows) > 1 and rows[0].verdict == "unknown")) and not verbose
-            for one in rows[: 1 if brief else None]:
+            alike = {one.verdict: sum(one.verdict == other.verdict for other in rows) for one in rows}
+            for one in {one.verdict: one for one in rows}.values() if brief else rows:
                 every = ", ".join(f"{name} {number(value)}" for name, value in one.numbers.items()) * verbose
                 whole = f"{one.question} {one.evidence}".strip() + f" ({every})" * bool(every)
-                what = whole if not brief else one.question if len(rows) == 1 else f"{len(rows)} questions"
+                count = alike[one.verdict]
+                what = whole if not brief else one.question if count == 1 else f"{count} questions"
                 what += " (for the reason above)" * (above and brief)
                 say(f"  {one.verdict:7s} {what}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
             do = f"For these {len(rows)}: " * (len(rows) > 1 and not brief) + change

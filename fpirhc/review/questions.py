@@ -355,7 +355,7 @@ def gain_by_run(case: Case) -> Fact:
     why = "it harms" if own.error >= found.alone else "a push grows" if own.admitted else "it is refused"
     says = why + BEST if not right else (RESERVE if calm else BUSIER) * poor
     if own.turned:  # also where a turned gain works
-        return Fact(Verdict.NO, numbers, of, f"{own.turned}.")
+        return Fact(Verdict.NO, numbers, of, f"{own.turned}.", says="it is refused")
     if verdict != Verdict.YES and best in (0.0, 1.0):
         tried = min(rungs, key=lambda times: rungs[times].error)
         numbers |= {"best_gain": tried * value, "error_at_best": rungs[tried].error}

@@ -120,7 +120,7 @@ def _plants(problem: Problem, seed: int) -> Quantity:
 
 
 QUANTITIES: Mapping[str, tuple[Callable[[Problem, int], Quantity], str]] = {  # and what grows, in words
-    "mismatch": (_mismatch, "all parameters are as far from the model, in % of how far in the file, up to 6 400 %"),
+    "mismatch": (_mismatch, "of all parameters, in % of that in the file, up to 6 400 %; 200 %: factors squared"),
     "plants": (_plants, f"{PLANTS} plants are drawn within this width, none of which may fail, up to 99 %"),
     "latency": (_latency, f"commands come later by whole cycles, up to {_FARTHEST}"),
     **{word: (partial(_sensed, word), fault.told) for word, fault in FAULTS.items()},

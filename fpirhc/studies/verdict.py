@@ -342,8 +342,7 @@ FLAGS = (  # of rows with one measure the first that is raised
          "in the response", True),
     Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], AT_LIMITS,
          "its command is at a limit of {at}, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
-    Flag(_swing, SWING, "both commands swing: on average each is {value:%} of its limits' range off the mean of the one before and "
-         "the one after", True),
+    Flag(_swing, SWING, "both commands swing from cycle to cycle, by {value:%} of their limits' range on average", True),
     Flag(_chatters, WILD, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
     Flag(_moved, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(lambda pair: math.nan if pair.adaptive.contraction is None else pair.adaptive.contraction.growing, 0.05,
@@ -492,4 +491,4 @@ def _remarks(entries: Sequence[Entry], first: Entry | None, yard: Yardstick, tol
         (least, best), *rest = sorted((v, n) for n, v in fair.items())
         among = " with the wrong model" * any(e.exact for e in entries)
         others = "".join(f"; {n} is within {math.ceil(100 * (v / least - 1))} %" for v, n in rest if v < NEAR * least)
-        yield f"Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference{others}."
+        yield f"Smallest rms error{among}: {best}, {in_percent(least)} of the motion{others}."
