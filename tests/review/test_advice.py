@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
+from helpers.plants import heavy
 from helpers.reviewed import NOISY, answers, behind_an_actuator, heater, law, mass, motor, plans, pushed_away
 
 import fpirhc as fp
@@ -98,6 +99,12 @@ def test_a_slip_of_units_is_named_where_a_controller_does_not_fit_and_where_it_i
     assert (fits.key, fits.verdict, fits.change.startswith(f"{mend} FixedPointSolver")) == ("fits", "no", True)
     first, *others = (a for a in answers(problem).values() if a.change)
     assert (first.evidence, {a.change for a in others}) == ("In the model m is 0.001 times the plant's.", {mend})
+
+
+@pytest.mark.parametrize(("ratio", "slip"), [(9.9, False), (10.1, True), (0.101, False), (0.099, True)])
+def test_a_parameter_ten_times_the_plants_is_a_slip(ratio, slip):
+    told = (answer.evidence for answer in answers(mass(plant=heavy(ratio, 1.0), duration=0.5)).values())
+    assert any("times the plant's" in one for one in told) == slip
 
 
 def test_a_response_without_a_value_on_the_reference_is_named_with_its_place():
