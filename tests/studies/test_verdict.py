@@ -126,7 +126,7 @@ FLAGS: dict[str, tuple[Facts, Facts, str, str]] = {
     "growth pauses": (*GROWTH(1.0, 3.0, 3.6, 10.8), "better", "none"),
     "growth slows": (*GROWTH(1.0, 4.0, 11.0, 18.0), "better", "none"),
     "limit": (Facts(), Facts(0.1, sends="full", size=0.4), "doubtful", "in 31.4 % of cycles (without it 0 %)"),
-    "both swing": (*SWINGS(2.0), "doubtful", "Both commands swing: on average each is 20 % of its limits' range off"),
+    "both swing": (*SWINGS(2.0), "doubtful", "Both commands swing from cycle to cycle, by 20 % of their"),
     "both swing little": (*SWINGS(0.4), "better", "none"),
     "chatter": (Facts(), Facts(0.1, sends="zigzag", size=0.0131), "doubtful", "it chatters, see fpirhc review"),
     "chatter of 10 ways": (Facts(), Facts(0.1, sends="waves", size=10.4), "doubtful", "varies 11.8 times as much as"),
@@ -295,7 +295,7 @@ def disturbed() -> tuple[fp.Problem, dict[str, Controller]]:
 
 def wide(scale: float, changes: dict[str, Any]) -> Said:
     """An error is measured against the range of the reference, or how far the start is from it, m; else weight, limits, or 1."""
-    share = lambda found: {r"rms error: law, (\S+) % of the range": 100 * found["law"].errors["y"] / scale}  # noqa: E731
+    share = lambda found: {r"rms error: law, (\S+) % of the motion": 100 * found["law"].errors["y"] / scale}  # noqa: E731
     return Said(lambda: alone(tank(**changes), law=fp.ComputedTorque(fp.Exponential(rate=20.0))), numbers=share)
 
 
