@@ -101,6 +101,27 @@ def test_a_slip_of_units_is_named_where_a_controller_does_not_fit_and_where_it_i
     assert (first.evidence, {a.change for a in others}) == ("In the model m is 0.001 times the plant's.", {mend})
 
 
+def test_no_weight_is_named_with_which_a_noisy_loop_moves_more():
+    """A plan that pays less for its command swings by itself, so that noise no longer doubles its movement."""
+    known = {
+        "m": fp.Parameter(1800.0, 1200.0, "1"),
+        "dry": fp.Parameter(0.0, 400.0, "1"),
+        "k": fp.Parameter(1e3, 3e3, "1"),
+    }
+    moves = lambda q, v, u, p: {"q": (u.M - 900 * v.q - p.dry * ca.tanh(v.q / 5e-3) - p.k * ca.sin(2 * q.q)) / p.m}  # noqa: E731
+    blade, wave = (
+        fp.Plant({"q": "rad"}, {"M": "N m"}, known, moves),
+        fp.Trajectory(lambda t: {"q": 0.2 + 0.1 * ca.sin(t)}),
+    )
+    task = {"period": 5e-3, "duration": 12.0, "measure_from": 4.0, "limits": fp.Limits(inputs={"M": (-6e3, 6e3)})}
+    task |= {"horizon": fp.Horizon(20, 0.03), "cost": fp.Quadratic({"q": 1e4, "q'": 1e2}, deviation={"M": 1e-5})}
+    shown = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(2e-4))}, fp.SavitzkyGolay(window=11, degree=2))
+    own = fp.RecedingHorizon(fp.FixedPointSolver(), fp.ModelReferenced(fp.Sigmoid(gain=-0.5)))
+    found = answers(fp.Problem(blade, wave, {"q": 0.2}, sensing=shown, **task), own)["noise"]
+    assert found.verdict == "caution"
+    assert "weight of the deviation" not in found.change
+
+
 @pytest.mark.parametrize(("ratio", "slip"), [(9.9, False), (10.1, True), (0.101, False), (0.099, True)])
 def test_a_parameter_ten_times_the_plants_is_a_slip(ratio, slip):
     told = (answer.evidence for answer in answers(mass(plant=heavy(ratio, 1.0), duration=0.5)).values())
